@@ -44,20 +44,12 @@ def imagine_episode(
     step 1 on; the world's uncertainty about the whole rollout, and its own estimate of success, are
     quality figures (`RolloutUncertainty.to_quality`).
 
-    Args:
-        source: a robot episode with head camera, touch and actions.
-        client: of the service with the world.
-        world: its name at the service.
-        store: destination of the imagined episode.
-        image_steps: steps whose images are needed; None for all. Images are kept for the chunks of
-            four steps that contain one of these. Use it only with worlds whose state does not
-            depend on chunk boundaries, since chunks are then shorter.
+    With `image_steps`, images are kept of the chunks of four steps that contain one of these. Use
+    it only with worlds whose state does not depend on chunk boundaries, since chunks are then
+    shorter.
 
-    Returns:
-        Its id; equal source and world give an equal id, and an existing episode is kept.
-
-    Raises:
-        UnknownNameError: no such world, or a source without head camera.
+    Returns its id; equal source and world give an equal id, and an existing episode is kept. Raises
+    UnknownNameError for no such world, or a source without head camera.
     """
     described = {description.name: description for description in client.worlds()}
     if world not in described:
@@ -127,7 +119,6 @@ def whole_steps(num_steps: int, chunk_multiple: int) -> int:
 
 
 def _chunks(num_steps: int, image_steps: Collection[int] | None) -> list[tuple[int, int, bool]]:
-    """First step, end step and image request of every chunk."""
     if image_steps is None:
         firsts = range(1, num_steps, CHUNK_STEPS)
         return [(first, min(first + CHUNK_STEPS, num_steps), True) for first in firsts]
@@ -143,10 +134,7 @@ def _chunks(num_steps: int, image_steps: Collection[int] | None) -> list[tuple[i
 
 
 def imagined_id(episode_id: str, world_digest: str) -> str:
-    """Id of an imagined episode, from its source and an abbreviated world digest.
-
-    A source's id that is too long to be a part of it is cut, and distinguished by its digest.
-    """
+    """Id of an imagined episode, from world digest and source; a long id is cut and digested."""
     name = f"imagined-{world_digest[:8]}-{episode_id}"
     if len(name) <= _MAX_ID_LENGTH:
         return name

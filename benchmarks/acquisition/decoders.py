@@ -43,15 +43,16 @@ from services.acquisition.drivers.base import DESCRIPTOR_REPORT, Decoder, Stream
 from services.acquisition.drivers.images import ImageEncoding
 from services.acquisition.drivers.packets import HEADER, OVERHEAD, SOURCES, VERSION, Packet
 from services.acquisition.drivers.packets import encode_packet as encode_ours
-from services.acquisition.mocks.cameras_and_robot import CameraSource, RobotStateSource
 from services.acquisition.mocks.faults import DeviceFaults
 from services.acquisition.mocks.gloves import encode_justfloat, encode_wuji
 from services.acquisition.mocks.replay import PacketSource, ReplayStream
-from services.acquisition.mocks.trackers import (
+from services.acquisition.mocks.trackers_and_cameras import (
     BridgeFingerTrackerSource,
     BridgePoseSource,
+    CameraSource,
     FingerTrackerSource,
     PoseTrackerSource,
+    RobotStateSource,
 )
 from services.acquisition.transports import READ_BYTES
 

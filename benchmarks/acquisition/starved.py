@@ -34,7 +34,7 @@ from services.acquisition.drivers.base import Driver
 from services.acquisition.drivers.packets import SOURCES, VERSION, Packet, encode_packet
 from services.acquisition.hid_process import HidProcessTransport
 from services.acquisition.mocks.replay import ReplayStream
-from services.acquisition.mocks.trackers import FingerTrackerSource
+from services.acquisition.mocks.trackers_and_cameras import FingerTrackerSource
 from services.acquisition.transports import HidTransport, SerialTransport, UsbAddress, open_hid
 
 Way = Literal["thread", "process"]

@@ -33,10 +33,10 @@ from dextouch.geometry import transform
 from dextouch.geometry.rotations import rotation_from_vector
 from dextouch.hands.actions import HandTrajectory, actions_from_poses, poses_from_actions
 from dextouch.hands.robot_hand import NUM_FINGERS, NUM_JOINTS, RobotHand
-from dextouch.tactile import PADS, in_contact, pad_forces_n
+from dextouch.tactile import DEXTOUCH_V1, PADS, in_contact
 from dextouch.tactile.layout import SIDES, Side, split_pads
 from services.alignment.retargeting import HandRetargeter
-from services.alignment.retargeting.wrist_transfer import (
+from services.alignment.retargeting.wrist import (
     MatchedPoints,
     anchored_joints,
     constant_offset_m,
@@ -56,8 +56,8 @@ from services.alignment.synchronization.resampling import (
 )
 from services.twin.demonstrators import NUM_GRID_STEPS
 from services.twin.episodes import Recorder, TakeOptions, TruthEpisode, TruthStream, record
-from services.twin.mjcf import FINGER_STIFFNESS_NM_RAD, WRIST_STIFFNESS_N_M, WRIST_STIFFNESS_NM_RAD
 from services.twin.names import Domain
+from services.twin.scene import FINGER_STIFFNESS_NM_RAD, WRIST_STIFFNESS_N_M, WRIST_STIFFNESS_NM_RAD
 from services.twin.settings import TwinSettings
 from services.twin.simulation import MODEL_RATE_HZ
 from services.twin.stage import Plan, Stage, command_row
@@ -279,7 +279,7 @@ def _retargeted(streams: dict[str, TruthStream], side: Side) -> RetargetedHand:
         poses_on_grid(wrist.values, _placed(wrist)),
         joints_rad,
         matched_points(vectors_on_grid(keypoints.values, at), joints_rad, hand),
-        vectors_on_grid(pad_forces_n(tactile.values), _placed(tactile)),
+        vectors_on_grid(DEXTOUCH_V1.pad_forces_n(tactile.values), _placed(tactile)),
     )
 
 

@@ -37,7 +37,7 @@ from dextouch.errors import InvalidInputError
 from dextouch.jobs import worker_pool
 from services.evaluation.bundled_policies import DEFAULT_POLICY
 from services.evaluation.settings import DEFAULT_PROBE, EARLY_POLICY
-from services.twin.scripted_actions import mistake_of
+from services.twin.stage import mistake_of
 from services.twin.tasks import EVALUATED
 
 _SERVO = "colour servo=services.evaluation.policies.colour_servo:ColourServo"

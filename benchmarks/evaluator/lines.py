@@ -26,7 +26,7 @@ from benchmarks.evaluator.plan import IDLE
 from dextouch.metrics.policy import mmrv, pearson
 from services.evaluation.settings import RISK_OF_DECIDED
 from services.evaluation.statistics import mmrv_of_draws, pearson_of_draws
-from services.twin.scripted_actions import mistake_of
+from services.twin.stage import mistake_of
 
 _IMAGES = ("psnr", "psnr_of_objects")
 _COPY, _CONTEXT = "chained contact F1 less copy", "chained contact F1 over F1 with true context"

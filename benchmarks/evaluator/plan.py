@@ -12,7 +12,7 @@ from dextouch.errors import InvalidInputError, UnknownNameError
 from services.evaluation.policies.outside import PolicySource
 from services.twin import mistakes
 from services.twin.mistakes import DEVELOPMENT, HELD_OUT, KINDS, TRAINING, Mistake
-from services.twin.scripted_actions import ELSEWHERE, HOLD, RETREAT, mistake_name, script_name
+from services.twin.stage import ELSEWHERE, HOLD, RETREAT, mistake_name, script_name
 
 SETS: Final[Mapping[str, tuple[str, ...]]] = {
     "development": tuple(DEVELOPMENT),

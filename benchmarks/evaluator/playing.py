@@ -27,7 +27,7 @@ from dextouch.worlds import StartedRollout, State, World
 from services.evaluation.endings import NUM_SEEN_STEPS, Ending
 from services.evaluation.policies.outside import action_chunk, ask
 from services.evaluation.prediction_scenes import warp_over_table
-from services.twin.scripted_actions import Actions
+from services.twin.stage import Actions
 from services.twin.world import TwinState, TwinWorld
 
 _NO_IMAGES = ReturnSelector(cameras=())

@@ -50,7 +50,8 @@ from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolic
 from services.evaluation.success_classifier import DECISION_THRESHOLD, SuccessClassifier
 from services.networks.weight_files import digest_of
 from services.twin.scene import object_boxes_m
-from services.twin.scripted_actions import (
+from services.twin.settings import TwinSettings
+from services.twin.stage import (
     ELSEWHERE,
     HOLD,
     Actions,
@@ -58,11 +59,10 @@ from services.twin.scripted_actions import (
     script_name,
     scripted_actions,
 )
-from services.twin.settings import TwinSettings
 from services.twin.world import TwinWorld
 from services.world_model.checkpoints import read_state_checkpoint, write_state_checkpoint
 from services.world_model.dynamics.model import DynamicsModel
-from services.world_model.shipped_checkpoints import default_checkpoint
+from services.world_model.settings import default_checkpoint
 from services.world_model.world import open_world
 
 

@@ -73,18 +73,19 @@ def _non_finite(check: Check) -> None:
         poses[..., 3], poses[1, 0, 2] = 1.0, bad
         check.true("an object somewhere unknown is absent", not known_objects(poses)[0])
         check.finite("features", object_features(poses))
-    check.true("probability of 1e-40 kPa in 0 … 1", 0 <= _probe().probability(_ending(1e-40)) <= 1)
+    probability = float(_probe().probabilities([_ending(1e-40)])[0])
+    check.true("probability of 1e-40 kPa in 0 … 1", 0 <= probability <= 1)
 
 
 @STAGE.cell("touch", "every taxel at 0, 650 and 99 999 kPa, and below zero")
 def _touch(check: Check) -> None:
     for pressure_kpa in (0.0, -5.0, 650.0, 99_999.0):
-        probability = _probe().probability(_ending(pressure_kpa))
+        probability = float(_probe().probabilities([_ending(pressure_kpa)])[0])
         check.true("probabilities in 0 … 1", 0 <= probability <= 1)
         touch = np.full_like(_seen().tactile_kpa, pressure_kpa)
         _command_is_bounded(check, _act(replace(_seen(), tactile_kpa=touch)))
     what = "a saturated hand in an empty scene: probability of success"
-    check.at_most(what, _probe().probability(_ending(99_999.0)), 0.5)
+    check.at_most(what, _probe().probabilities([_ending(99_999.0)])[0], 0.5)
 
 
 @STAGE.cell("ends", "an ending of 2 steps; the policy at step 0 and long after its horizon")
@@ -139,7 +140,7 @@ def _long_run(check: Check) -> None:
 def _batch(check: Check) -> None:
     endings = [_ending(pressure) for pressure in (0.0, 1.0, 2.0, 5.0, 10.0, 20.0, 40.0, 650.0)]
     together = _probe().probabilities(endings)
-    alone = [_probe().probability(ending) for ending in endings]
+    alone = [_probe().probabilities([ending])[0] for ending in endings]
     check.at_most("probabilities differ", np.abs(together - alone).max(), 1e-5)
     many = _probe().probabilities(endings[:2] * 150).reshape(-1, 2)
     off = np.abs(many - together[:2]).max()

@@ -22,8 +22,8 @@ from services.world_model.checkpoints import (
 )
 from services.world_model.dynamics.features import DynamicsConfig
 from services.world_model.dynamics.model import DynamicsModel
-from services.world_model.rendering.configuration import RendererConfig
-from services.world_model.rendering.network import RendererNetwork
+from services.world_model.network.configuration import RendererConfig
+from services.world_model.rendering.renderer import RendererNetwork
 from services.world_model.state_world import StateWorld
 from services.world_model.world import open_world
 

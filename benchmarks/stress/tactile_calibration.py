@@ -4,8 +4,8 @@ import numpy as np
 
 from benchmarks.stress.cells import Check, StageCells
 from dextouch.errors import NonFiniteError
-from dextouch.tactile import pad_forces_n
-from dextouch.tactile.layout import NUM_TAXELS, raw_indices
+from dextouch.tactile import DEXTOUCH_V1
+from dextouch.tactile.layout import NUM_TAXELS
 from services.alignment.calibration.tactile_gain import TaxelPress, fit_gain
 from services.alignment.calibration.tactile_tare import (
     SATURATED,
@@ -13,12 +13,13 @@ from services.alignment.calibration.tactile_tare import (
     TactileCalibration,
     TaxelTare,
     measure_tare,
+    taxel_faults,
+    unusable_taxels,
 )
-from services.alignment.calibration.taxel_faults import taxel_faults, unusable_taxels
 
 STAGE = StageCells("tactile-calibration")
 _TARE, _GAIN, _FULL = 500.0, 100.0, 65_535.0
-_CELLS = raw_indices(side="left")
+_CELLS = DEXTOUCH_V1.raw_indices(side="left")
 
 
 @STAGE.cell("clock", "a rest take of 59 readings, and one that jumps half-way")
@@ -50,8 +51,9 @@ def _non_finite(check: Check) -> None:
     kpa = found.to_kpa(counts, refused=refused)
     check.true("an absent taxel is named and zero", refused[3] > 0 and not kpa[:, 3].any())
     check.finite("pressures", kpa)
-    check.refused("NaN to forces", pad_forces_n, np.full((1, 320), np.nan), kind=NonFiniteError)
-    tiny = pad_forces_n(np.full((1, 320), 5e-324))
+    forces_n = DEXTOUCH_V1.pad_forces_n
+    check.refused("NaN to forces", forces_n, np.full((1, 320), np.nan), kind=NonFiniteError)
+    tiny = forces_n(np.full((1, 320), 5e-324))
     check.at_most("force of 5e-324 kPa", tiny.max(), 0.0, "N")
 
 

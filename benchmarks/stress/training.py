@@ -14,10 +14,11 @@ from dextouch.errors import DegenerateRotationError, InvalidInputError, NonFinit
 from services.world_model.network.configuration import NetworkConfig, Precision
 from services.world_model.network.flow_matching import MIN_TIME, training_times
 from services.world_model.network.inputs import build_inputs
+from services.world_model.network.model import JointWorldModel
 from services.world_model.paper_settings import OptimizerSettings, TrainSettings, WindowSettings
 from services.world_model.training.dataset import EpisodeArrays, WindowBatch, WindowSampler
-from services.world_model.training.episode_split import check_disjoint
-from services.world_model.training.objective import LossOptions, losses
+from services.world_model.training.episode_sets import check_disjoint
+from services.world_model.training.objective import Losses, LossOptions, errors, examples_of
 from services.world_model.training.trainer import TrainingRun
 
 STAGE = StageCells("training")
@@ -127,7 +128,7 @@ def _batch(check: Check) -> None:
             alone = model(one, model.first_latents(one), part, t[index : index + 1])
             off = float((alone.video[0] - together.video[index]).abs().max())
             check.at_most("guesses differ", off, 1e-4)
-    pair = [losses(model, batch, generator=torch.Generator().manual_seed(1)) for _ in "ab"]
+    pair = [_losses(model, batch, generator=torch.Generator().manual_seed(1)) for _ in "ab"]
     check.equal(
         "the same seed, the same loss",
         pair[0].video.detach().numpy(),
@@ -145,7 +146,7 @@ def _precision(check: Check) -> None:
             weight.add_(0.05 * torch.randn(weight.shape, generator=generator))
     batch = _batch_of(_episode(), 4)
     exact, coarse = (
-        losses(
+        _losses(
             run.model,
             batch,
             generator=torch.Generator().manual_seed(1),
@@ -163,7 +164,7 @@ def _device(check: Check) -> None:
     run = _run(_episode())
     batch = _batch_of(_episode(), 4)
     model = run.model.to("meta")
-    loss = losses(model, batch, generator=torch.Generator().manual_seed(1))
+    loss = _losses(model, batch, generator=torch.Generator().manual_seed(1))
     torch.autograd.backward(loss.video + loss.tactile)
     check.true("losses stay there", loss.video.is_meta and loss.tactile.is_meta)
 
@@ -172,6 +173,17 @@ STAGE.does_not_apply(
     one_axis="nothing is estimated from motion; see hand-eye",
     clock="windows are cut by steps; see resampling",
 )
+
+
+def _losses(
+    model: JointWorldModel,
+    batch: WindowBatch,
+    *,
+    generator: torch.Generator,
+    options: LossOptions = LossOptions(),  # noqa: B008 - immutable
+) -> Losses:
+    examples = examples_of(model, batch, generator=generator, options=options)
+    return errors(model, examples, options.precision)
 
 
 @cache

@@ -8,12 +8,13 @@ import torch
 from benchmarks.stress import worlds
 from benchmarks.stress.cells import Check, StageCells
 from benchmarks.stress.worlds import Subject
+from benchmarks.world_model.coarse import with_coarse_products
 from dextouch.streams import HEAD_CAMERA
 from services.world_model.checkpoints import Checkpoint, read_checkpoint
 from services.world_model.network.flow_matching import add_noise, sample, shift_time
 from services.world_model.network.inputs import PredictionRequest, build_inputs
 from services.world_model.network.model import JointWorldModel, stack_noise
-from services.world_model.shipped_checkpoints import paper_form_checkpoint
+from services.world_model.settings import paper_form_checkpoint
 from services.world_model.world import ModelWorld
 
 STAGE = StageCells("world-model")
@@ -45,7 +46,7 @@ def _ends(check: Check) -> None:
 def _precision(check: Check) -> None:
     subject = _subject()
     exact = subject.step(subject.actions[:16])
-    coarse_worlds = {"bfloat16 products": ModelWorld(_checkpoint(), precision="bfloat16")}
+    coarse_worlds = {"bfloat16 products": ModelWorld(with_coarse_products(_checkpoint()))}
     for dtype in (torch.bfloat16, torch.float16, torch.float64):
         model = read_checkpoint(paper_form_checkpoint()).model.to(dtype)
         checkpoint = Checkpoint(model, _checkpoint().metadata, _checkpoint().digest)

@@ -15,8 +15,8 @@ from dextouch.hands.actions import JOINTS_LEFT, WRIST_LEFT
 from dextouch.schemas import CHUNK_STEPS, Observation, ReturnSelector, RolloutStart
 from dextouch.streams import HEAD_CAMERA
 from dextouch.worlds import BatchWorld, State, SteppedRollout, World
-from services.twin.scripted_actions import script_name, scripted_actions
 from services.twin.settings import TwinSettings
+from services.twin.stage import script_name, scripted_actions
 from services.twin.world import TwinWorld
 
 NUM_CHUNKS = 63

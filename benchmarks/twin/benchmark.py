@@ -17,10 +17,9 @@ from benchmarks.figures import Figure, Requirement, at_least, at_most, every_rou
 from benchmarks.report import ResultTable, StageReport
 from benchmarks.stages import Amounts, Bar
 from dextouch.schemas import CHUNK_STEPS, EVERYTHING, ReturnSelector, RolloutStart
-from services.twin.scripted_actions import script_name, scripted_actions
 from services.twin.settings import TwinSettings
 from services.twin.simulation import STEPS_PER_GRID, STEPS_PER_TACTILE, Simulation
-from services.twin.stage import Plan, Stage, command_row
+from services.twin.stage import Plan, Stage, command_row, script_name, scripted_actions
 from services.twin.tasks import TASK_NAMES
 from services.twin.world import TwinState, TwinWorld
 

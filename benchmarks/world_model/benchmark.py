@@ -16,19 +16,20 @@ from benchmarks.evaluator.playing import start_in_twin
 from benchmarks.figures import Figure, Requirement, at_least, at_most, every_round, interleaved
 from benchmarks.report import ResultTable, StageReport
 from benchmarks.stages import Amounts, Bar
+from benchmarks.world_model.coarse import with_coarse_products
 from dextouch.errors import InvalidInputError
 from dextouch.metrics.tactile import contact_f1
 from dextouch.schemas import CHUNK_STEPS, EVERYTHING, Observation, ReturnSelector, RolloutStart
 from dextouch.streams import HEAD_CAMERA
 from dextouch.worlds import BatchWorld, CopyFirstWorld, World
-from services.twin.scripted_actions import script_name, scripted_actions
 from services.twin.settings import TwinSettings
+from services.twin.stage import script_name, scripted_actions
 from services.twin.tasks import TASK_NAMES
 from services.twin.world import TwinWorld
 from services.world_model.checkpoints import read_checkpoint, read_state_checkpoint
 from services.world_model.network.configuration import Precision, Sampler
 from services.world_model.network.model import Sampling
-from services.world_model.shipped_checkpoints import PRETRAINED, STATE_MODEL, paper_form_checkpoint
+from services.world_model.settings import PRETRAINED, STATE_MODEL, paper_form_checkpoint
 from services.world_model.state_world import StateWorld
 from services.world_model.world import ModelWorld
 
@@ -302,9 +303,8 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     network = checkpoint.metadata.network
     variants = {
         one.name: ModelWorld(
-            checkpoint,
+            checkpoint if one.precision == "float32" else with_coarse_products(checkpoint),
             sampling=Sampling(one.steps, one.sampler, keep_context=not one.recomputed),
-            precision=one.precision,
         )
         for one in VARIANTS
     }

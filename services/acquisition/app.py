@@ -1,44 +1,115 @@
-"""The application of one station; its devices, recorder and uploads live as long as it."""
+"""Application of one station, and of the practice station that a mock one starts when wanted."""
 
-from collections.abc import AsyncIterator, Sequence
-from contextlib import asynccontextmanager
+import asyncio
+from collections.abc import AsyncIterator, Callable, Sequence
+from contextlib import AsyncExitStack, asynccontextmanager
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
-from fastapi import FastAPI
+from fastapi import APIRouter, Depends, FastAPI
 from starlette.concurrency import run_in_threadpool
+from starlette.types import Receive, Scope, Send
 
 from dextouch.data_folder import practice_spool
 from dextouch.episodes import disk_errors
-from dextouch.errors import InvalidInputError
-from dextouch.serving import create_service_app, serve
+from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
+from dextouch.schemas import PracticeStatus
+from dextouch.serving import RequireScope, create_service_app, serve
 from dextouch.tactile import TactileLayout, read_layout
+from services.acquisition import retention, routes
 from services.acquisition.clock import StationClock
 from services.acquisition.devices import build_drivers, load_calibration
-from services.acquisition.follow_watch import MakeFollowCheck
 from services.acquisition.health.metrics import HealthCollector, RecorderCollector
-from services.acquisition.memory import keep_for_life
-from services.acquisition.practice import PRACTICE_PATH, Practice
-from services.acquisition.recorder import Recorder
-from services.acquisition.retention import (
-    DeletedTakes,
-    OperatorNames,
-    remove_take,
-    spooled_takes,
-)
-from services.acquisition.routes import (
-    faults_router,
-    live_router,
-    recorder_router,
-    station_router,
-    uploads_router,
-)
+from services.acquisition.recorder import Recorder, keep_for_life
 from services.acquisition.settings import AcquisitionSettings, with_enrolment
 from services.acquisition.station import Station
 from services.acquisition.uploader import Uploader, ids_in_store, recover_spool
+from services.acquisition.watches import MakeFollowCheck
 
 if TYPE_CHECKING:
     from services.acquisition.mock_station import MockStation
+
+PRACTICE_PATH: Final = "/practice"
+
+
+class Practice:
+    """An ASGI application that serves the practice station while there is one.
+
+    `make` makes it; None where devices are real.
+    """
+
+    def __init__(self, make: Callable[[], FastAPI] | None) -> None:
+        self._make = make
+        self._lock = asyncio.Lock()
+        self._running: AsyncExitStack | None = None
+        self._app: FastAPI | None = None
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass a request on.
+
+        Raises:
+            NotFoundError: the practice devices are off.
+        """
+        if self._app is None:
+            raise NotFoundError("practice devices: they are off; POST /v1/practice/start first")
+        await self._app(scope, receive, send)
+
+    @property
+    def status(self) -> PracticeStatus:
+        """Whether the practice devices run."""
+        if self._make is None:
+            return PracticeStatus(state="unavailable")
+        return PracticeStatus(state="off" if self._app is None else "on")
+
+    async def start(self) -> PracticeStatus:
+        """Start the devices, which takes seconds; nothing happens if they run.
+
+        Raises:
+            ConflictError: the station has real devices.
+        """
+        if self._make is None:
+            raise ConflictError(
+                "practice devices: this station has real devices; practise with "
+                "`dextouch up --mock` in another data folder"
+            )
+        async with self._lock:
+            if self._app is None:
+                app = await run_in_threadpool(self._make)
+                self._running = AsyncExitStack()
+                await self._running.enter_async_context(app.router.lifespan_context(app))
+                self._app = app
+        return self.status
+
+    async def stop(self) -> PracticeStatus:
+        """Stop the devices; nothing happens if they do not run."""
+        async with self._lock:
+            self._app, running, self._running = None, self._running, None
+            if running is not None:
+                await running.aclose()
+        return self.status
+
+    def router(self) -> APIRouter:
+        """Routes that start and stop it."""
+        router = APIRouter(
+            prefix="/v1/practice", tags=["station"], dependencies=[Depends(RequireScope("station"))]
+        )
+
+        @router.get("")
+        async def get_practice() -> PracticeStatus:
+            """Whether devices to practise calibration with run, below `/practice`."""
+            return self.status
+
+        @router.post("/start")
+        async def start_practice() -> PracticeStatus:
+            """Start the practice devices."""
+            return await self.start()
+
+        @router.post("/stop")
+        async def stop_practice() -> PracticeStatus:
+            """Stop the practice devices."""
+            return await self.stop()
+
+        return router
 
 
 def _real_station(settings: AcquisitionSettings, follow: MakeFollowCheck | None) -> Station:
@@ -68,8 +139,8 @@ def practice_app(settings: AcquisitionSettings) -> FastAPI:
     practice = settings.model_copy(update={"spool": spool, "episode_store_url": None})
     with disk_errors(f"make the spool {spool}"):
         spool.mkdir(parents=True, exist_ok=True)
-    for take in spooled_takes(spool):
-        remove_take(take)
+    for take in retention.spooled_takes(spool):
+        retention.remove_take(take)
     mock = MockStation(
         pattern.practice_streams(settings.seed, layout=_mock_layout(settings)),
         FaultScript(devices=pattern.PRACTICE_FAULTS),
@@ -101,7 +172,7 @@ def _mock_station(settings: AcquisitionSettings, follow: MakeFollowCheck | None)
     streams, known = pattern_streams(layout=layout), pattern_calibration()
     if settings.mock_store is not None and settings.mock_episode_id is not None:
         from dextouch.episodes import EpisodeStore
-        from services.acquisition.mocks.replay import replay_calibration, replay_streams
+        from services.acquisition.mocks.replay import replay_streams
 
         if layout is not None:
             raise InvalidInputError(
@@ -109,7 +180,7 @@ def _mock_station(settings: AcquisitionSettings, follow: MakeFollowCheck | None)
                 "them: an episode says the layout of its gloves"
             )
         episode = EpisodeStore(settings.mock_store).open(settings.mock_episode_id)
-        streams, known = replay_streams(episode), {**known, **replay_calibration(episode)}
+        streams, known = replay_streams(episode), {**known, **episode.attributes.matrices()}
     scripts = {"first_light": FaultScript.first_light, "worn_glove": FaultScript.worn_glove}
     return MockStation(
         streams,
@@ -139,11 +210,11 @@ def _make_uploader(settings: AcquisitionSettings, recorder: Recorder) -> Uploade
         store,
         period_s=settings.upload_period_s,
         retention=settings,
-        deleted=DeletedTakes(
+        deleted=retention.DeletedTakes(
             settings.spool,
             settings.station,
             stored_as=ids_in_store,
-            operators=OperatorNames(recorder.session_operators, recorder.forget_operator),
+            operators=retention.OperatorNames(recorder.session.operators, recorder.session.forget),
         ),
     )
 
@@ -169,8 +240,8 @@ def create_app(
     mock = _mock_station(settings, follow) if settings.mock else None
     station = _real_station(settings, follow) if mock is None else mock.station
     uploads = uploader or _make_uploader(settings, station.recorder)
-    wanted = settings.require_consent
-    station.recorder.needs_consent = not settings.mock if wanted is None else wanted
+    is_required = settings.require_consent
+    station.recorder.needs_consent = not settings.mock if is_required is None else is_required
     practice = Practice(partial(practice_app, settings) if settings.mock else None)
     return _station_app(settings, station, mock, uploads, practice)
 
@@ -216,11 +287,11 @@ def _station_app(
         name="acquisition",
         settings=settings,
         routers=[
-            recorder_router(station),
-            station_router(station, uploads),
-            uploads_router(uploads),
-            live_router(station),
-            faults_router(mock),
+            routes.recorder_router(station),
+            routes.station_router(station, uploads),
+            routes.uploads_router(uploads),
+            routes.live_router(station),
+            routes.faults_router(mock),
             *([practice.router()] if practice is not None else []),
         ],
         lifespan=lifespan,

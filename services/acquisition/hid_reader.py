@@ -1,8 +1,7 @@
 """Program that reads one HID device and passes its reports on; `HidProcessTransport` starts it.
 
-The kernel keeps 63 unread reports, of a finger tracker those of 88 ms. A thread of a busy station
-comes too late for that, since it waits for Python's lock after every report; a process that does
-nothing else does not. It imports little, so that it starts in a few hundredths of a second.
+A thread of a busy station comes too late for the 63 reports that the kernel keeps
+(docs/device_packets.md). It imports little, so that it starts in a few hundredths of a second.
 
 Usage: python -m services.acquisition.hid_reader VENDOR_ID PRODUCT_ID [SERIAL_NUMBER]
 """

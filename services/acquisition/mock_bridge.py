@@ -17,7 +17,7 @@ import numpy as np
 from dextouch.tactile.layout import Side
 from services.acquisition.mocks.faults import DeviceFaults
 from services.acquisition.mocks.pattern import ROUND_S, pattern_streams
-from services.acquisition.mocks.trackers import (
+from services.acquisition.mocks.trackers_and_cameras import (
     BridgeFingerTrackerSource,
     BridgePoseSource,
     BridgeSource,
@@ -39,9 +39,7 @@ def pattern_source(kind: str, place: str, *, seed: int) -> BridgeSource:
 class BridgeServer(socketserver.ThreadingTCPServer):
     """Says hello to every connection, and then the same samples at the same times to all of them.
 
-    Args:
-        source: what it says; it samples too fast for a bridge to need signs of life.
-        port: to listen on; any free one if 0.
+    The source samples too fast for a bridge to need signs of life.
     """
 
     allow_reuse_address = daemon_threads = True

@@ -15,34 +15,23 @@ from dextouch.errors import ConflictError, DeviceError, InvalidInputError
 from dextouch.schemas import Matrix, SaveTake, SimulatedFault, TakeCheck, TakePrompt
 from dextouch.tactile.layout import SIDES
 from services.acquisition.clock import StationClock, VirtualClock, Waiter
+from services.acquisition.devices import kinds
 from services.acquisition.devices.camera import CameraDecoder
-from services.acquisition.devices.kinds import (
-    ENTRY_POINT_GROUP,
-    IMPORT_FAILURES,
-    device_kind,
-    kind_names,
-)
 from services.acquisition.devices.robot_state import STREAM_SIZES, RobotStateDecoder
 from services.acquisition.drivers.base import Decoder, Driver
-from services.acquisition.follow_watch import MakeFollowCheck
-from services.acquisition.mocks.cameras_and_robot import (
-    CameraSource,
-    RobotStateSource,
-    video_camera,
-)
+from services.acquisition.mocks import replay
 from services.acquisition.mocks.faults import Edit, FaultScript, Ledger, Pinned
 from services.acquisition.mocks.ports import SocketPort
-from services.acquisition.mocks.replay import (
-    MockDevice,
-    MockPair,
-    MockSlot,
-    PacketSource,
-    ReplayStream,
-    device_rng,
+from services.acquisition.mocks.trackers_and_cameras import (
+    CameraSource,
+    RobotStateSource,
+    mock_finger_tracker,
+    mock_pose_tracker,
+    video_camera,
 )
-from services.acquisition.mocks.trackers import mock_finger_tracker, mock_pose_tracker
 from services.acquisition.settings import MockLinks, SpoolSafety
 from services.acquisition.station import Station
+from services.acquisition.watches import MakeFollowCheck
 
 LATENCY_SIGMA_MS = 0.2
 WRISTS = ("wrist_left", "wrist_right")
@@ -56,29 +45,29 @@ SLOW_S = 0.1
 DEAD_CELL = 9
 
 
-def mock_glove_of(kind_name: str, place: MockSlot) -> MockPair:
+def mock_glove_of(kind_name: str, slot: replay.MockSlot) -> replay.MockPair:
     """A simulated glove of a kind of this package or another one.
 
     Raises:
         UnknownNameError: no package brings the kind.
         InvalidInputError: the kind has no mock, it cannot be imported, or it gives something else.
     """
-    kind = device_kind(kind_name)
+    kind = kinds.device_kind(kind_name)
     if kind.mock is None:
         raise InvalidInputError(
             f"kind of device {kind_name!r}: got no mock, expected one to simulate it; choose "
-            f"another kind for the mock station ({', '.join(kind_names())}) or write its mock"
+            f"another kind for the mock station ({', '.join(kinds.kind_names())}) or write its mock"
         )
     where = f"mock of kind {kind_name!r} ({kind.mock})"
     try:
-        make = EntryPoint(kind_name, kind.mock, ENTRY_POINT_GROUP).load()
-    except IMPORT_FAILURES as error:
+        make = EntryPoint(kind_name, kind.mock, kinds.ENTRY_POINT_GROUP).load()
+    except kinds.IMPORT_FAILURES as error:
         raise InvalidInputError(
             f"{where}: got {type(error).__name__}: {error}, expected a function 'module:function' "
             "of a MockSlot; fix the package that provides the kind"
         ) from error
-    pair: object = make(place)
-    if not isinstance(pair, MockPair):
+    pair: object = make(slot)
+    if not isinstance(pair, replay.MockPair):
         raise InvalidInputError(
             f"{where}: gave {type(pair).__name__}, expected a services.acquisition.mocks.MockPair; "
             "fix the package that provides the kind"
@@ -87,14 +76,14 @@ def mock_glove_of(kind_name: str, place: MockSlot) -> MockPair:
 
 
 def build_mocks(
-    streams: Sequence[ReplayStream],
+    streams: Sequence[replay.ReplayStream],
     *,
     faults: FaultScript,
     seed: int,
     clock: StationClock,
     links: MockLinks | None = None,
     unit_seed: int | None = None,
-) -> list[MockPair]:
+) -> list[replay.MockPair]:
     """The mock devices that a set of streams needs.
 
     Streams of ground truth alone are left out. `unit_seed` is that of the devices' own offsets and
@@ -107,26 +96,26 @@ def build_mocks(
     if len(named) != len(streams):
         raise InvalidInputError("mock station: two streams of the same name")
 
-    def place(name: str, stream: str) -> MockSlot:
-        return MockSlot(
+    def slot(name: str, stream: str) -> replay.MockSlot:
+        return replay.MockSlot(
             name, named[stream], faults.of(name), seed, clock, links.trackers, unit_seed
         )
 
     pairs = []
     for side in SIDES:
         if (tactile := f"tactile_{side}") in named:
-            pairs.append(mock_glove_of(links.gloves, place(f"glove_{side}", tactile)))
+            pairs.append(mock_glove_of(links.gloves, slot(f"glove_{side}", tactile)))
         if (keypoints := f"keypoints_{side}") in named:
-            pairs.append(mock_finger_tracker(place(f"finger_tracker_{side}", keypoints)))
+            pairs.append(mock_finger_tracker(slot(f"finger_tracker_{side}", keypoints)))
     trackers = [*WRISTS, "head"]
     if "joints_measured" in named:
         by_trackers = WRISTS if links.wrists == "trackers" else ()
         source = RobotStateSource({n: s for n, s in named.items() if n in STREAM_SIZES})
         decoder = RobotStateDecoder([name for name in STREAM_SIZES if name not in by_trackers])
-        pairs.append(_on_socket(place("robot_state", "joints_measured"), source, decoder))
+        pairs.append(_on_socket(slot("robot_state", "joints_measured"), source, decoder))
         trackers = ["head", *by_trackers]
-    pairs += [mock_pose_tracker(place(f"pose_tracker_{n}", n)) for n in trackers if n in named]
-    pairs += [_camera(place(n, n), links) for n in named if n.startswith("camera_")]
+    pairs += [mock_pose_tracker(slot(f"pose_tracker_{n}", n)) for n in trackers if n in named]
+    pairs += [_camera(slot(n, n), links) for n in named if n.startswith("camera_")]
     if not pairs:
         raise InvalidInputError(
             f"mock station: got streams {sorted(named)}, expected tactile_…, keypoints_…, "
@@ -135,24 +124,26 @@ def build_mocks(
     return pairs
 
 
-def _camera(place: MockSlot, links: MockLinks) -> MockPair:
+def _camera(slot: replay.MockSlot, links: MockLinks) -> replay.MockPair:
     if links.cameras == "station":
-        return video_camera(place, encoding=links.images)
-    height_px, width_px = place.stream.descriptor.shape[:2]
+        return video_camera(slot, encoding=links.images)
+    height_px, width_px = slot.stream.descriptor.shape[:2]
     decoder = CameraDecoder(
-        place.name, height_px=height_px, width_px=width_px, encoding=links.images
+        slot.name, height_px=height_px, width_px=width_px, encoding=links.images
     )
-    return _on_socket(place, CameraSource(place.stream, encoding=links.images), decoder)
+    return _on_socket(slot, CameraSource(slot.stream, encoding=links.images), decoder)
 
 
-def _on_socket(place: MockSlot, source: PacketSource, decoder: Decoder) -> MockPair:
-    port = SocketPort(place.name)
-    driver = Driver(place.name, transport=port.transport, decoder=decoder, clock=place.clock)
-    return MockPair(MockDevice(place, source, port), driver)
+def _on_socket(
+    slot: replay.MockSlot, source: replay.PacketSource, decoder: Decoder
+) -> replay.MockPair:
+    port = SocketPort(slot.name)
+    driver = Driver(slot.name, transport=port.transport, decoder=decoder, clock=slot.clock)
+    return replay.MockPair(replay.MockDevice(slot, source, port), driver)
 
 
 def _known_of(
-    pairs: Sequence[MockPair], seed: int, *, error_ms: float = LATENCY_SIGMA_MS
+    pairs: Sequence[replay.MockPair], seed: int, *, error_ms: float = LATENCY_SIGMA_MS
 ) -> dict[str, Matrix]:
     """What a calibrated station knows of these devices.
 
@@ -162,7 +153,7 @@ def _known_of(
     known: dict[str, Matrix] = {}
     for pair in pairs:
         known |= pair.calibration
-        rng, faults = device_rng(seed, f"latency_{pair.device.name}"), pair.device.faults
+        rng, faults = replay.device_rng(seed, f"latency_{pair.device.name}"), pair.device.faults
         wrong_ms = error_ms * rng.standard_normal() if faults.path_delay_ms else 0.0
         measured_ns = round(max(0.0, faults.path_delay_ms + wrong_ms) * 1e6)
         for descriptor in pair.driver.descriptors:
@@ -196,7 +187,7 @@ class MockStation:
 
     def __init__(  # noqa: PLR0913 - all but the first four have a sensible default
         self,
-        streams: Sequence[ReplayStream],
+        streams: Sequence[replay.ReplayStream],
         faults: FaultScript,
         seed: int,
         clock: StationClock,
@@ -355,7 +346,7 @@ class MockStation:
         for thread, _ in self._players:
             thread.start()
 
-    def _run(self, pair: MockPair, waiter: Waiter, offset_ns: int, forever: bool) -> None:  # noqa: FBT001 - of a thread
+    def _run(self, pair: replay.MockPair, waiter: Waiter, offset_ns: int, forever: bool) -> None:  # noqa: FBT001 - of a thread
         device, epoch_ns = pair.device, self._epoch_ns
         with closing(waiter):
             try:

@@ -1,5 +1,7 @@
 """Recorder of a station: one take at a time in a spool, and the count of saved ones."""
 
+import ctypes
+import gc
 import shutil
 import threading
 from collections.abc import Callable, Mapping, Sequence
@@ -9,43 +11,36 @@ from pathlib import Path
 from secrets import token_hex
 from typing import Final
 
+import numpy as np
 import structlog
 from pydantic import ValidationError
 
+from dextouch import schemas
 from dextouch.clocks import PathLatency
 from dextouch.episodes import disk_errors, replace_file
 from dextouch.episodes.spool import SpoolWriter
 from dextouch.errors import ConflictError, InvalidInputError, StorageError
-from dextouch.schemas import (
-    Matrix,
-    RecorderAction,
-    RecorderSession,
-    RecorderState,
-    RecorderStatus,
-    RecordingAttributes,
-    SavedTakes,
-    SaveTake,
-    TakeCheck,
-    TakePrompt,
-)
 from dextouch.serving import ServedFolder
 from dextouch.tracing import current_trace_id
 from services.acquisition.clock import StationClock
 from services.acquisition.drivers.base import Driver
-from services.acquisition.follow_watch import FollowWatch
 from services.acquisition.health.monitor import HealthMonitor
-from services.acquisition.memory import give_back_free_memory
-from services.acquisition.path_latency import add_latencies
 from services.acquisition.settings import SpoolSafety
-from services.acquisition.take import Take, check_free_space
-from services.acquisition.take_check import DeviceEvents, TakeWatch, incomplete_cause
+from services.acquisition.take import (
+    DeviceEvents,
+    Take,
+    TakeWatch,
+    check_free_space,
+    incomplete_cause,
+)
+from services.acquisition.watches import FollowWatch, add_latencies
 
 logger = structlog.get_logger(__name__)
 
 SESSION_FILE: Final = "session.json"
 # Takes of these tasks show devices and a board; guided runs record them without an operator.
 CALIBRATION: Final = ("calibrate-glove", "calibrate-time")
-ACTIONS: Mapping[RecorderState, tuple[RecorderAction, ...]] = {
+ACTIONS: Mapping[schemas.RecorderState, tuple[schemas.RecorderAction, ...]] = {
     "idle": ("arm",),
     "armed": ("arm", "record", "discard"),
     "recording": ("stop", "discard", "rerecord"),
@@ -54,7 +49,7 @@ ACTIONS: Mapping[RecorderState, tuple[RecorderAction, ...]] = {
     "discarded": ("arm",),
 }
 # The state that each action leads to.
-NEXT: Mapping[RecorderAction, RecorderState] = {
+NEXT: Mapping[schemas.RecorderAction, schemas.RecorderState] = {
     "arm": "armed",
     "record": "recording",
     "stop": "checking",
@@ -62,6 +57,12 @@ NEXT: Mapping[RecorderAction, RecorderState] = {
     "discard": "discarded",
     "rerecord": "armed",
 }
+# What numpy keeps of small arrays that were freed, for each size in bytes, to give it out again
+# (numpy/_core/src/multiarray/alloc.c).
+CACHED_BYTES, CACHED_ARRAYS = 1024, 7
+# Looked up once: every handle of the C library is a class of its own, which only the collector of
+# cycles removes.
+_TRIM = getattr(ctypes.CDLL(None), "malloc_trim", None)
 
 
 class Recorder:
@@ -84,7 +85,7 @@ class Recorder:
         spool_root: Path,
         drivers: Sequence[Driver],
         clock: StationClock,
-        calibration: Mapping[str, Matrix],
+        calibration: Mapping[str, schemas.Matrix],
         safety: SpoolSafety | None = None,
         device_events: Callable[[], DeviceEvents] | None = None,
         health: HealthMonitor | None = None,
@@ -104,19 +105,19 @@ class Recorder:
         self._stated: frozenset[str] = frozenset()
         # Held for a whole action, disk included; readers never take it.
         self._lock = threading.RLock()
-        self._state: RecorderState = "idle"
+        self._state: schemas.RecorderState = "idle"
         self._discarded_id: str | None = None
-        self._session = SessionCount(spool_root)
+        self.session = SessionCount(spool_root)
         self.needs_consent = False
         self._arm(None)
 
-    def status(self) -> RecorderStatus:
+    def status(self) -> schemas.RecorderStatus:
         """Where it stands."""
         with self._lock:
             self._settle()
             take, check = self.take, self._check
             problems = [problem.message for problem in check.problems] if check else []
-            return RecorderStatus(
+            return schemas.RecorderStatus(
                 state=self._state,
                 actions=ACTIONS[self._state],
                 recording_id=self._recording_id(),
@@ -127,11 +128,11 @@ class Recorder:
                 else {},
                 problems=(*(take.problems() if take else ()), *problems),
                 check=check,
-                session=self._session.now,
+                session=self.session.now,
                 needs_consent=self.needs_consent,
             )
 
-    def arm(self, prompt: TakePrompt) -> RecorderStatus:
+    def arm(self, prompt: schemas.TakePrompt) -> schemas.RecorderStatus:
         """Set the prompt of the next take.
 
         Raises:
@@ -146,7 +147,7 @@ class Recorder:
             )
         return self._act("arm", None, partial(self._arm, prompt))
 
-    def record(self, recording_id: str | None = None) -> RecorderStatus:
+    def record(self, recording_id: str | None = None) -> schemas.RecorderStatus:
         """Start the take.
 
         Raises:
@@ -155,11 +156,11 @@ class Recorder:
         """
         return self._act("record", recording_id, partial(self._record, recording_id))
 
-    def stop(self, recording_id: str | None = None) -> RecorderStatus:
+    def stop(self, recording_id: str | None = None) -> schemas.RecorderStatus:
         """End the take and check it."""
         return self._act("stop", recording_id, self._stop)
 
-    def save(self, how: SaveTake) -> RecorderStatus:
+    def save(self, how: schemas.SaveTake) -> schemas.RecorderStatus:
         """Keep the take: its spool is closed and waits for the upload.
 
         Raises:
@@ -175,11 +176,11 @@ class Recorder:
                 )
             return status
 
-    def discard(self, recording_id: str | None = None) -> RecorderStatus:
+    def discard(self, recording_id: str | None = None) -> schemas.RecorderStatus:
         """Throw the take away, spool included."""
         return self._act("discard", recording_id, self._discard)
 
-    def rerecord(self, recording_id: str | None = None) -> RecorderStatus:
+    def rerecord(self, recording_id: str | None = None) -> schemas.RecorderStatus:
         """Throw the take away and arm its prompt again."""
         with self._lock:
             again = recording_id is not None and recording_id == self._discarded_id
@@ -187,21 +188,10 @@ class Recorder:
                 return self.status()
             return self._act("rerecord", recording_id, self._rerecord)
 
-    def begin_session(self) -> RecorderStatus:
+    def begin_session(self) -> schemas.RecorderStatus:
         """Count saved takes from zero again; what was saved stays."""
-        with self._lock:
-            self._session.begin()
-            return self.status()
-
-    def session_operators(self) -> tuple[str, ...]:
-        """Pseudonyms that the session's counts name."""
-        with self._lock:
-            return self._session.operators()
-
-    def forget_operator(self, operator: str) -> None:
-        """Remove a pseudonym from the session's counts."""
-        with self._lock:
-            self._session.forget(operator)
+        self.session.begin()
+        return self.status()
 
     def close(self) -> None:
         """Give the files back; an unsaved take stays in the spool for the next start."""
@@ -210,8 +200,8 @@ class Recorder:
                 self.take.release()
 
     def _act(
-        self, action: RecorderAction, recording_id: str | None, do: Callable[[], None]
-    ) -> RecorderStatus:
+        self, action: schemas.RecorderAction, recording_id: str | None, do: Callable[[], None]
+    ) -> schemas.RecorderStatus:
         """Do what is possible now and was not done to the named take before."""
         with self._lock:
             self._settle()
@@ -234,7 +224,7 @@ class Recorder:
             self._state = "checking"
             self._done.add("stop")
 
-    def _is_done(self, action: RecorderAction, recording_id: str | None) -> bool:
+    def _is_done(self, action: schemas.RecorderAction, recording_id: str | None) -> bool:
         """Whether the action was done to the named take; an unnamed one is never a repetition."""
         present = self._recording_id()
         if recording_id is None or (action == "record" and present is None):
@@ -247,12 +237,12 @@ class Recorder:
             )
         return action in self._done
 
-    def _arm(self, prompt: TakePrompt | None) -> None:
+    def _arm(self, prompt: schemas.TakePrompt | None) -> None:
         self._prompt = prompt
         self.take: Take | None = None
-        self._check: TakeCheck | None = None
+        self._check: schemas.TakeCheck | None = None
         self._saved_as: bool | None = None
-        self._done: set[RecorderAction] = set()
+        self._done: set[schemas.RecorderAction] = set()
 
     def _record(self, recording_id: str | None) -> None:
         attributes = self._attributes(recording_id)
@@ -283,7 +273,7 @@ class Recorder:
             stop_ns = take.watch.started_ns + round(take.watch.duration_s * 1e9)
             self._health.history.end_take(take.spool.attributes.recording_id, stop_ns)
 
-    def _save(self, how: SaveTake) -> None:
+    def _save(self, how: schemas.SaveTake) -> None:
         take, check = self.take, self._check
         if take is None or check is None:
             raise ConflictError("recorder: there is no take; record one first")
@@ -308,7 +298,7 @@ class Recorder:
         if self._prompt is not None:
             saved = spool.attributes
             cause = saved.incomplete_cause
-            self._session.add(self._prompt, saved.recording_id, incomplete=cause)
+            self.session.add(self._prompt, saved.recording_id, incomplete=cause)
         give_back_free_memory()
 
     def _discard(self) -> None:
@@ -327,7 +317,7 @@ class Recorder:
         self._discard()
         self._arm(self._prompt)
 
-    def _attributes(self, recording_id: str | None) -> RecordingAttributes:
+    def _attributes(self, recording_id: str | None) -> schemas.RecordingAttributes:
         prompt = self._prompt
         if prompt is None:
             raise ConflictError("record: nothing was armed; arm first")
@@ -336,7 +326,7 @@ class Recorder:
         for driver in self._drivers.values():
             stated |= driver.begin_take()
         self._stated = frozenset(stated)
-        return RecordingAttributes(
+        return schemas.RecordingAttributes(
             recording_id=recording_id or f"{now:%Y%m%d-%H%M%S}-{token_hex(3)}",
             station=self._station,
             started_at=now,
@@ -351,31 +341,32 @@ class Recorder:
 
 
 class SessionCount:
-    """The present session; counts survive a restart and the deletion of uploaded takes.
+    """The present session, for any thread; counts survive a restart and removals of takes.
 
     A session that cannot be written is counted in memory: a take that is saved must stay saved.
     """
 
     def __init__(self, spool_root: Path) -> None:
         self._path = spool_root / SESSION_FILE
-        self.now = self._read() or RecorderSession(started_at=datetime.now(UTC))
+        self._lock = threading.Lock()
+        self.now = self._read() or schemas.RecorderSession(started_at=datetime.now(UTC))
 
     def begin(self) -> None:
         """Begin a new session, in which nothing was saved yet."""
-        fresh = {"started_at": datetime.now(UTC), "saved": ()}
-        self._write(self.now.model_copy(update=fresh))
+        with self._lock:
+            self._write(started_at=datetime.now(UTC), saved=())
 
-    def add(self, prompt: TakePrompt, recording_id: str, *, incomplete: str = "") -> None:
+    def add(self, prompt: schemas.TakePrompt, recording_id: str, *, incomplete: str = "") -> None:
         """Count a saved take; `incomplete` says why it is, if it is."""
-        key = (prompt.task, prompt.operator)
-        counts = {(item.task, item.operator): item.num_saved for item in self.now.saved}
-        counts[key] = counts.get(key, 0) + 1
-        saved = tuple(
-            SavedTakes(task=task, operator=operator, num_saved=count)
-            for (task, operator), count in counts.items()
-        )
-        last = {"last_saved": recording_id, "last_incomplete": incomplete}
-        self._write(self.now.model_copy(update={"saved": saved, **last}))
+        with self._lock:
+            key = (prompt.task, prompt.operator)
+            counts = {(item.task, item.operator): item.num_saved for item in self.now.saved}
+            counts[key] = counts.get(key, 0) + 1
+            saved = tuple(
+                schemas.SavedTakes(task=task, operator=operator, num_saved=count)
+                for (task, operator), count in counts.items()
+            )
+            self._write(saved=saved, last_saved=recording_id, last_incomplete=incomplete)
 
     def operators(self) -> tuple[str, ...]:
         """All operators that the counts name."""
@@ -384,11 +375,11 @@ class SessionCount:
 
     def forget(self, operator: str) -> None:
         """Remove an operator's counts."""
-        saved = tuple(item for item in self.now.saved if item.operator != operator)
-        self._write(self.now.model_copy(update={"saved": saved}))
+        with self._lock:
+            self._write(saved=tuple(item for item in self.now.saved if item.operator != operator))
 
-    def _write(self, session: RecorderSession) -> None:
-        self.now = session
+    def _write(self, **changed: object) -> None:
+        self.now = session = self.now.model_copy(update=changed)
         try:
             with disk_errors(f"write {self._path.name}"):
                 # In a spool that is gone this fails: only a take may create it.
@@ -396,11 +387,41 @@ class SessionCount:
         except StorageError as error:
             logger.warning("fail_session_count", error=error.message)
 
-    def _read(self) -> RecorderSession | None:
+    def _read(self) -> schemas.RecorderSession | None:
         try:
-            return RecorderSession.model_validate_json(self._path.read_bytes())
+            return schemas.RecorderSession.model_validate_json(self._path.read_bytes())
         except FileNotFoundError:
             return None
         except (OSError, ValidationError) as error:
             logger.warning("fail_session_count", error=str(error))
             return None
+
+
+def keep_for_life() -> None:
+    """Exclude all existing objects from garbage collection; call once, in a station's process.
+
+    Otherwise each collection would visit modules, classes and devices and block all threads for
+    tens of milliseconds. Automatic collections then also run after fewer takes. It also fills
+    numpy's cache of small arrays (4 MB), which would otherwise grow over many takes.
+    """
+    small = [np.empty(n, np.uint8) for n in range(CACHED_BYTES) for _ in range(CACHED_ARRAYS)]
+    small.clear()
+    gc.collect()
+    gc.freeze()
+    # The next full collection starts when young objects exceed a quarter of these.
+    gc.collect()
+
+
+def give_back_free_memory() -> bool:
+    """Between takes: milliseconds. False where the C library has no `malloc_trim` (not glibc).
+
+    glibc keeps free memory in the process, a little more after each take, until this is called.
+    Circles are looked for after `keep_for_life` only: without it that would hold up readers in the
+    middle of a take, if it is an upload that calls this.
+    """
+    if gc.get_freeze_count():
+        gc.collect()
+    if _TRIM is None:
+        return False
+    _TRIM(ctypes.c_size_t(0))
+    return True

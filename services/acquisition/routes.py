@@ -6,23 +6,9 @@ from fastapi import APIRouter, Body, Depends, Query, Response
 from pydantic import Field
 from starlette.concurrency import run_in_threadpool
 
+from dextouch import schemas
 from dextouch.errors import ConflictError
 from dextouch.frozen_model import FrozenModel
-from dextouch.schemas import (
-    CameraList,
-    HealthEvents,
-    HealthHistory,
-    RecorderStatus,
-    SaveTake,
-    SetFault,
-    SimulatedFault,
-    StationHealth,
-    StationOverview,
-    StoreId,
-    TakeName,
-    TakePrompt,
-    UploadStatus,
-)
 from dextouch.serving import JSON, MSGPACK, RequireScope
 from dextouch.streams import MAX_STREAMS, pack
 from services.acquisition.health.history import NUM_ROWS, encoded_history
@@ -34,7 +20,7 @@ from services.acquisition.uploader import Uploader
 if TYPE_CHECKING:
     from services.acquisition.mock_station import MockStation
 
-Named = Annotated[TakeName | None, Body()]
+Named = Annotated[schemas.TakeName | None, Body()]
 
 
 def recorder_router(station: Station) -> APIRouter:
@@ -43,42 +29,44 @@ def recorder_router(station: Station) -> APIRouter:
     recorder = station.recorder
 
     @router.get("")
-    async def get_recorder() -> RecorderStatus:
+    async def get_recorder() -> schemas.RecorderStatus:
         """Current state of the recorder."""
         return await run_in_threadpool(recorder.status)
 
     @router.post("/arm")
-    async def arm_recorder(prompt: TakePrompt) -> RecorderStatus:
+    async def arm_recorder(prompt: schemas.TakePrompt) -> schemas.RecorderStatus:
         """Announce task and instruction."""
         return await run_in_threadpool(recorder.arm, prompt)
 
     @router.post("/record")
-    async def start_recording(take: Named = None) -> RecorderStatus:
+    async def start_recording(take: Named = None) -> schemas.RecorderStatus:
         """Start the take."""
         return await run_in_threadpool(recorder.record, take.recording_id if take else None)
 
     @router.post("/stop")
-    async def stop_recording(take: Named = None) -> RecorderStatus:
+    async def stop_recording(take: Named = None) -> schemas.RecorderStatus:
         """End the take and check it."""
         return await run_in_threadpool(recorder.stop, take.recording_id if take else None)
 
     @router.post("/save")
-    async def save_take(how: Annotated[SaveTake | None, Body()] = None) -> RecorderStatus:
+    async def save_take(
+        how: Annotated[schemas.SaveTake | None, Body()] = None,
+    ) -> schemas.RecorderStatus:
         """Keep the take."""
-        return await run_in_threadpool(recorder.save, how or SaveTake())
+        return await run_in_threadpool(recorder.save, how or schemas.SaveTake())
 
     @router.post("/discard")
-    async def discard_take(take: Named = None) -> RecorderStatus:
+    async def discard_take(take: Named = None) -> schemas.RecorderStatus:
         """Throw the take away."""
         return await run_in_threadpool(recorder.discard, take.recording_id if take else None)
 
     @router.post("/rerecord")
-    async def rerecord_take(take: Named = None) -> RecorderStatus:
+    async def rerecord_take(take: Named = None) -> schemas.RecorderStatus:
         """Throw the take away and arm the same prompt again."""
         return await run_in_threadpool(recorder.rerecord, take.recording_id if take else None)
 
     @router.post("/session")
-    async def begin_session() -> RecorderStatus:
+    async def begin_session() -> schemas.RecorderStatus:
         """Begin a session: the count of saved takes starts at zero."""
         return await run_in_threadpool(recorder.begin_session)
 
@@ -90,7 +78,9 @@ def faults_router(mock: "MockStation | None") -> APIRouter:
     router = _router("/v1/faults")
 
     @router.post("/{fault}")
-    async def set_fault(fault: SimulatedFault, body: SetFault) -> tuple[SimulatedFault, ...]:
+    async def set_fault(
+        fault: schemas.SimulatedFault, body: schemas.SetFault
+    ) -> tuple[schemas.SimulatedFault, ...]:
         """Begin or end a fault; those that are on."""
         if mock is None:
             raise ConflictError(
@@ -119,20 +109,20 @@ def station_router(station: Station, uploader: Uploader) -> APIRouter:
     router = _router("/v1")
 
     @router.get("/health")
-    async def get_station_health() -> StationHealth:
+    async def get_station_health() -> schemas.StationHealth:
         """Every stream and device."""
         health = await run_in_threadpool(station.health.report)
         return health.model_copy(update={"faults": station.faults})
 
     @router.get("/health/events")
-    async def list_health_events(since_ns: int = 0) -> HealthEvents:
+    async def list_health_events(since_ns: int = 0) -> schemas.HealthEvents:
         """When something was raised and when it ended, on the station's clock."""
         return station.health.events(since_ns)
 
     @router.get(
         "/health/history",
         response_class=Response,
-        responses={200: {"model": HealthHistory, "content": {MSGPACK: {}}}},
+        responses={200: {"model": schemas.HealthHistory, "content": {MSGPACK: {}}}},
     )
     async def get_health_history(query: Annotated[HistoryQuery, Query()]) -> Response:
         """Health of the newest hour, about a row a second, and all takes of that hour.
@@ -158,17 +148,17 @@ def uploads_router(uploader: Uploader) -> APIRouter:
     router = _router("/v1/uploads")
 
     @router.get("")
-    async def list_uploads(refused: Annotated[bool, Query()] = False) -> list[UploadStatus]:  # noqa: FBT002 - a query's flag
+    async def list_uploads(refused: Annotated[bool, Query()] = False) -> list[schemas.UploadStatus]:  # noqa: FBT002 - a query's flag
         """Saved takes and whether the store has them; with `refused`, those alone it refused."""
         return await run_in_threadpool(uploader.status, only_refused=refused)
 
     @router.get("/{recording_id}")
-    async def get_upload(recording_id: StoreId) -> UploadStatus:
+    async def get_upload(recording_id: schemas.StoreId) -> schemas.UploadStatus:
         """One saved take and whether the store has it."""
         return await run_in_threadpool(uploader.status_of, recording_id)
 
     @router.post("/{recording_id}/retry")
-    async def retry_upload(recording_id: StoreId) -> UploadStatus:
+    async def retry_upload(recording_id: schemas.StoreId) -> schemas.UploadStatus:
         """Send a take again that the store refused."""
         return await run_in_threadpool(uploader.retry, recording_id)
 
@@ -204,9 +194,9 @@ def live_router(station: Station) -> APIRouter:
         return Response(pack({"age_s": ages_s}, poses), media_type=MSGPACK)
 
     @router.get("/cameras")
-    async def list_cameras() -> CameraList:
+    async def list_cameras() -> schemas.CameraList:
         """Cameras that have sent an image."""
-        return CameraList(cameras=tuple(station.live.cameras(station.clock.now_ns())))
+        return schemas.CameraList(cameras=tuple(station.live.cameras(station.clock.now_ns())))
 
     @router.get(
         "/cameras/{name}", response_class=Response, responses={200: {"content": {"image/jpeg": {}}}}
@@ -219,12 +209,12 @@ def live_router(station: Station) -> APIRouter:
     return router
 
 
-def station_overview(station: Station) -> StationOverview:
+def station_overview(station: Station) -> schemas.StationOverview:
     """The station in a few values, for a page that shows many stations."""
     health, recorder = station.health.report(), station.recorder.status()
     ages_s = [stream.age_s for stream in health.streams if stream.age_s is not None]
     widest = next((cause for cause in health.causes if cause.level == health.level), None)
-    return StationOverview(
+    return schemas.StationOverview(
         station=station.name,
         level=health.level,
         cause=widest.message if widest else "",

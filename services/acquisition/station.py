@@ -16,13 +16,12 @@ from dextouch.streams import H264_UNIT, MOUNTS, Sample, StreamDescriptor, Stream
 from services.acquisition.clock import StationClock
 from services.acquisition.drivers.base import Driver, Readings
 from services.acquisition.drivers.images import GroupPreview
-from services.acquisition.follow_watch import FollowWatch, MakeFollowCheck
-from services.acquisition.glove_record import NO_CELL, glove_record
+from services.acquisition.health.cells import NO_CELL, glove_record
 from services.acquisition.health.monitor import HealthMonitor
-from services.acquisition.path_latency import PathWatch
 from services.acquisition.recorder import Recorder
 from services.acquisition.settings import SpoolSafety
 from services.acquisition.supervisor import DeviceSupervisor
+from services.acquisition.watches import FollowWatch, MakeFollowCheck, PathWatch
 
 CONNECT_TIMEOUT_S = 10.0
 # Of a quaternion that says where a body points.

@@ -444,8 +444,8 @@ class UsbTransport(HandleTransport[_Opened]):
         ids = {"idVendor": self._address.vendor_id, "idProduct": self._address.product_id}
         found = usb.core.find(find_all=True, backend=self._context, **ids)
         candidates = [(device, _serial_number(device)) for device in found]
-        wanted = self._address.serial_number
-        matching = [device for device, number in candidates if wanted in {None, number}]
+        serial_number = self._address.serial_number
+        matching = [device for device, number in candidates if serial_number in {None, number}]
         for device, _ in candidates:
             if matching != [device]:
                 usb.util.dispose_resources(device)
@@ -458,9 +458,9 @@ class UsbTransport(HandleTransport[_Opened]):
                 f"{present}"
             )
         raise DeviceError(
-            f"{self.info}: device {wanted or 'of these ids'!r} is not plugged in; present: "
+            f"{self.info}: device {serial_number or 'of these ids'!r} is not plugged in; present: "
             f"{present}",
-            serial_number=wanted,
+            serial_number=serial_number,
         )
 
     def _take(self, device: "Device") -> _Opened:

@@ -33,7 +33,7 @@ from dextouch.schemas import (
 )
 from dextouch.streams import StreamDescriptor, decode_body, frame_body
 from dextouch.tracing import in_trace, new_trace
-from services.acquisition.memory import give_back_free_memory
+from services.acquisition.recorder import give_back_free_memory
 from services.acquisition.retention import (
     RECORDING_FILE,
     REFUSED_FILE,
@@ -65,15 +65,10 @@ MAX_BATCH_BYTES = 8 * 2**20
 class Uploader:
     """Sends closed spools in the background, one after the other, until the store has them all.
 
-    The bytes of the spool are sent as they lie there. What the store acknowledged is not sent
-    again, also not by the next process: batch n of a stream is always the same samples, and the
-    store says which batch it expects next.
-
-    A take whose id another recording of the store has is stored under a second one, `second_id`. A
-    take that the store refuses permanently is quarantined: it stays in the spool until `retry`. One
-    that was deleted in the store is removed.
-
-    Without a store, which `stop` closes, takes stay in the spool.
+    Batch n of a stream is always the same samples, so that the store says which one it expects
+    next. A take whose id another recording of the store has is stored under a second one,
+    `second_id`; one that the store refuses permanently stays in the spool until `retry`; one that
+    was deleted in the store is removed. Without a store, which `stop` closes, takes stay.
     """
 
     def __init__(

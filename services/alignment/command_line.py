@@ -22,7 +22,7 @@ from dextouch.errors import DexTouchError, InvalidInputError, NotFoundError
 from dextouch.free_text import printable
 from dextouch.hands.hand_files import load_hand
 from dextouch.jobs import Workers, run_jobs
-from dextouch.schemas import json_ready, load_scene_objects
+from dextouch.schemas import SceneObjects, json_ready
 from dextouch.serving import load_settings
 from dextouch.tactile import CONTACT_THRESHOLD_KPA
 from services.alignment.jobs import AlignmentWorker, align_recording, check_recording, episode_id_of
@@ -31,7 +31,7 @@ from services.alignment.retargeting.hand_retargeter import calibrated_profile
 from services.alignment.schemas import AlignmentReport, report_of
 from services.alignment.settings import AlignmentOptions, AlignmentSettings, align_parser
 from services.alignment.synchronization import Progress
-from services.alignment.synchronization.resampling import RefusedPart
+from services.alignment.synchronization.resampling import RefusedPart, RefusedReason
 
 NS_PER_S = 1e9
 # The recording, and how far it is.
@@ -43,20 +43,19 @@ EXIT_REFUSED = 3
 PAGE_WIDTH = 110
 # Taxels for each reason, and refused parts, that a page lists; the report has all.
 MAX_LISTED = 12
-WHY = {
+WHY: Mapping[RefusedReason, str] = {
     "late_start": "began later than the others",
     "early_end": "ended earlier than the others",
     "gap": "no samples",
+    "jump": "samples elsewhere",
+    "frozen": "frozen samples",
+    "limits": "samples beyond limits",
     "shorter": "a longer stretch without a gap was taken",
 }
 
 
 def main(argv: Sequence[str]) -> int:
-    """Run `dextouch align`: align recordings, report on one, or retarget one to another hand.
-
-    Returns:
-        0, or 3 if a recording was refused, with the reason on stderr.
-    """
+    """Run `dextouch align`; returns 0, or 3 if a recording was refused (reason on stderr)."""
     settings = load_settings(AlignmentSettings, [])
     parsed = align_parser(settings).parse_args(list(argv))
     if getattr(parsed, "objects", None) is not None:
@@ -67,13 +66,13 @@ def main(argv: Sequence[str]) -> int:
 def _run(parsed: argparse.Namespace, settings: AlignmentSettings) -> int:
     if parsed.all == bool(parsed.recordings):
         raise InvalidInputError("run: expected either ID … or --all; see run --help")
-    wanted, refused = list(dict.fromkeys(parsed.recordings)), list[Outcome]()
+    recording_ids, refused = list(dict.fromkeys(parsed.recordings)), list[Outcome]()
     if parsed.all:
-        wanted, refused = not_aligned(EpisodeStore(parsed.store), settings.wanted_options)
+        recording_ids, refused = not_aligned(EpisodeStore(parsed.store), settings.wanted_options)
     console = Console(highlight=False, soft_wrap=True)
     reports, num_failed = [], 0
-    batch = parsed.store, wanted, settings.wanted_options
-    with _bars(console, len(wanted)) as on_progress:
+    batch = parsed.store, recording_ids, settings.wanted_options
+    with _bars(console, len(recording_ids)) as on_progress:
         if parsed.ray is None:
             outcomes = align_batch(*batch, num_workers=parsed.workers, on_progress=on_progress)
         else:
@@ -95,17 +94,17 @@ def _run(parsed: argparse.Namespace, settings: AlignmentSettings) -> int:
 def _bars(console: Console, num_recordings: int) -> Iterator[OnRecordingProgress]:
     """A bar for each recording at work and one for all; without a terminal, lines."""
     lines = ProgressLines("align", has_bar=console.is_terminal)
-    shown: dict[str, TaskID] = {}
+    tasks: dict[str, TaskID] = {}
     shares: dict[str, float] = {}
     with Bars(console=console, disable=not console.is_terminal, transient=True) as bars:
         whole = bars.add_task(f"{num_recordings} recordings", total=max(num_recordings, 1))
 
         def on_progress(recording_id: str, progress: Progress) -> None:
-            if recording_id not in shown:
-                shown[recording_id] = bars.add_task(recording_id, total=1.0)
+            if recording_id not in tasks:
+                tasks[recording_id] = bars.add_task(recording_id, total=1.0)
             where = f"{recording_id} {progress.stage} {progress.stream or ''}"
             shares[recording_id] = progress.share
-            bars.update(shown[recording_id], completed=progress.share, description=where)
+            bars.update(tasks[recording_id], completed=progress.share, description=where)
             bars.update(whole, completed=sum(shares.values()))
             num_done = sum(share >= 1 for share in list(shares.values()))
             share = f"{progress.share:.0%}"
@@ -168,7 +167,7 @@ def _markers(parsed: argparse.Namespace, settings: AlignmentSettings) -> int:
     del settings
     from services.alignment.markers import marker_sheet
 
-    page = marker_sheet(load_scene_objects(parsed.objects))
+    page = marker_sheet(SceneObjects.load(parsed.objects))
     with disk_errors(f"write {parsed.to}"):
         parsed.to.write_text(page, encoding="utf-8")
     print(f"{parsed.to}: print at 100 %, then measure the side of one marker")
@@ -183,10 +182,9 @@ def align_batch(
     num_workers: int,
     on_progress: OnRecordingProgress,
 ) -> Iterator[Outcome]:
-    """Align recordings in parallel; yields outcomes as they complete. Failures do not stop others.
+    """Align recordings in parallel processes; yields outcomes, also failures, as they complete.
 
-    `num_workers` are aligned at the same time, each in its own process; `on_progress` is called
-    from several threads.
+    `on_progress` is called from several threads.
     """
     workers = [AlignmentWorker(store_url) for _ in range(num_workers)]
     idle = workers.copy()
@@ -233,18 +231,17 @@ def _align_one(store_url: str, options: AlignmentOptions, recording_id: str) -> 
 
 def not_aligned(store: EpisodeStore, options: AlignmentOptions) -> tuple[list[str], list[Outcome]]:
     """Recordings without an episode under these options: ids to align, and what is refused."""
-    wanted, refused = list[str](), list[Outcome]()
+    recording_ids, refused = list[str](), list[Outcome]()
     for recording_id in store.list(kind="recording"):
         try:
             if not store.exists(check_recording(store, recording_id, options)):
-                wanted.append(recording_id)
+                recording_ids.append(recording_id)
         except DexTouchError as error:
             refused.append((recording_id, error))
-    return wanted, refused
+    return recording_ids, refused
 
 
 def _find_episode(store: EpisodeStore, item_id: str, options: AlignmentOptions) -> EpisodeReader:
-    """An episode by its id, or by that of the recording it was made from."""
     if store.exists(item_id):
         return store.open(item_id)
     return store.open(episode_id_of(store.recording(item_id), options))
@@ -277,7 +274,6 @@ def report_page(report: AlignmentReport) -> Group:
 
 
 def _unreliable(report: AlignmentReport) -> list[str]:
-    """Streams whose times may be wrong, with the reasons."""
     found = []
     for clock in report.clocks:
         texts = {
@@ -293,7 +289,6 @@ def _unreliable(report: AlignmentReport) -> list[str]:
 
 
 def _implausible(report: AlignmentReport) -> list[str]:
-    """What of the streams could not be true, and the steps that gaps left to interpolation."""
     texts = {
         "jump_samples": "samples elsewhere",
         "lasting_jumps": "leaps of its world",

@@ -1,7 +1,4 @@
-"""Alignment jobs of one service, kept in SQLite so that they outlive a crash or a power failure.
-
-Every step of a job is committed to disk before anyone hears of it; only progress is kept in memory.
-"""
+"""Alignment jobs of a service, whose steps are committed to SQLite before anyone hears of them."""
 
 import asyncio
 import sqlite3
@@ -53,17 +50,12 @@ RETRY_AFTER_S = 5
 
 
 class JobQueue:
-    """All jobs of one service, in the order in which they were submitted.
+    """All jobs of one service in the order of submission; belongs to one event loop.
 
     Change jobs only while holding `lock`; a change that cannot be saved raises `StorageError` and
-    leaves them as they were. Belongs to one event loop.
-
-    Args:
-        max_open: jobs that may wait or run.
-        max_kept: jobs that are remembered; the oldest ended ones are forgotten first.
-
-    Attributes:
-        problem: why the jobs could not be opened; they are neither listed nor accepted then.
+    leaves them as they were. `max_open` jobs may wait or run; of more than `max_kept` the oldest
+    ended ones are forgotten. `problem` is why the jobs could not be opened: none are listed or
+    accepted then.
     """
 
     def __init__(self, *, max_open: int, max_kept: int) -> None:
@@ -76,10 +68,7 @@ class JobQueue:
     async def open(self, folder: Path) -> list[AlignmentJob]:
         """Load the jobs kept in a folder; returns those that were running when it was left.
 
-        Raises:
-            ConflictError: another service uses the folder.
-            CorruptDataError: the jobs on disk are damaged.
-            StorageError: they cannot be read or written.
+        Raises ConflictError: another service uses it; CorruptDataError; StorageError.
         """
         try:
             self._database, self._jobs = await asyncio.to_thread(_open_jobs, folder)
@@ -96,11 +85,7 @@ class JobQueue:
             self._database = None
 
     def get(self, alignment_id: str) -> AlignmentJob:
-        """The current state of a job.
-
-        Raises:
-            NotFoundError: never submitted, or ended long ago.
-        """
+        """The current state of a job; raises NotFoundError: never submitted, or ended long ago."""
         self._require_open()
         if alignment_id not in self._jobs:
             raise NotFoundError(
@@ -116,13 +101,7 @@ class JobQueue:
         limit: int,
         recording_ids: Collection[str] = (),
     ) -> AlignmentList:
-        """Some of the jobs, or of those in one state, oldest first, from the one `after` an id on.
-
-        With `recording_ids`, only those of these recordings.
-
-        Raises:
-            NotFoundError: there is no job `after`.
-        """
+        """Some jobs, oldest first, after an id; raises NotFoundError if there is no such job."""
         self._require_open()
         jobs = [
             (position, job)
@@ -131,12 +110,12 @@ class JobQueue:
             and (not recording_ids or job.recording_id in recording_ids)
         ]
         last = -1 if after is None else list(self._jobs).index(self.get(after).alignment_id)
-        rest = [job for position, job in jobs if position > last]
-        shown = rest[:limit]
+        remaining = [job for position, job in jobs if position > last]
+        page = remaining[:limit]
         return AlignmentList(
-            alignments=tuple(job.with_eta() for job in shown),
+            alignments=tuple(job.with_eta() for job in page),
             num_matching=len(jobs),
-            next_after=shown[-1].alignment_id if len(rest) > limit else None,
+            next_after=page[-1].alignment_id if len(remaining) > limit else None,
         )
 
     def num_jobs(self, state: JobState) -> int:
@@ -168,11 +147,7 @@ class JobQueue:
         return known is not None and known.state == "running" and known.started_at == job.started_at
 
     async def add(self, jobs: Sequence[AlignmentJob]) -> None:
-        """Append new jobs; those that wait, run or are done stay as they are.
-
-        Raises:
-            LimitExceededError: too many would be open; none is added.
-        """
+        """Append jobs that are new or failed; raises LimitExceededError if too many are open."""
         known = {key for key, job in self._jobs.items() if job.state not in {"failed", "cancelled"}}
         new = {job.alignment_id: job for job in jobs if job.alignment_id not in known}
         num_open = sum(job.state not in ENDED for job in self._jobs.values())
@@ -229,17 +204,10 @@ def _open_jobs(folder: Path) -> tuple["JobDatabase", dict[str, AlignmentJob]]:
 
 
 class JobDatabase:
-    """The table of jobs in SQLite; one process at a time may open it.
+    """The table of jobs in SQLite, in a folder that is made if needed; for one process at a time.
 
-    Every commit is on disk when it returns (write-ahead log, synchronous=FULL).
-
-    Args:
-        folder: of the database, created if needed.
-
-    Raises:
-        ConflictError: another process has it open.
-        CorruptDataError: the database is damaged.
-        StorageError: it cannot be read or written.
+    Every commit is on disk when it returns. Raises ConflictError: another process has it open;
+    CorruptDataError: it is damaged; StorageError: it cannot be read or written.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -263,17 +231,13 @@ class JobDatabase:
             raise CorruptDataError(f"{self._path}: damaged (it is empty); {MOVE_AWAY}")
 
     def load(self) -> dict[str, AlignmentJob]:
-        """Jobs by id, in the order in which they were submitted.
-
-        Raises:
-            CorruptDataError: a row does not match its checksum or is not a job.
-        """
+        """Jobs by id, in order of submission; raises CorruptDataError for a damaged row."""
         select = "SELECT position, crc32c, CAST(job AS BLOB) FROM jobs ORDER BY position"
         with self._errors("read"), self._guard:
             rows = self._connection.execute(select).fetchall()
         jobs = {}
-        for place, crc32c, body in rows:
-            where = f"{self._path}, job {place}"
+        for position, crc32c, body in rows:
+            where = f"{self._path}, job {position}"
             # A table of others may hold anything, such as nothing at all.
             if not isinstance(body, bytes) or google_crc32c.value(body) != crc32c:
                 raise CorruptDataError(f"{where}: does not match its checksum; {MOVE_AWAY}")
@@ -288,11 +252,7 @@ class JobDatabase:
         return jobs
 
     def commit(self, removed: Iterable[str], saved: Iterable[AlignmentJob]) -> None:
-        """Remove jobs, then insert or update others, in one transaction.
-
-        Raises:
-            StorageFullError: no space is left; nothing changed.
-        """
+        """Remove jobs and write others in one transaction; raises StorageFullError."""
         delete = "DELETE FROM jobs WHERE alignment_id = ?"
         with self._errors("write"), self._guard, self._connection as connection:
             connection.executemany(delete, [(key,) for key in removed])
@@ -329,7 +289,6 @@ class JobDatabase:
 
     @contextmanager
     def _errors(self, verb: str) -> Iterator[None]:
-        """Turn errors of SQLite into ours."""
         what = f"{verb} {self._path}"
         try:
             yield

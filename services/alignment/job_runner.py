@@ -1,7 +1,4 @@
-"""Runs the alignment jobs of a service in worker processes, and submits those of new recordings.
-
-Jobs are resumed after a restart.
-"""
+"""Runs the alignment jobs of a service in worker processes, and submits those of new recordings."""
 
 import asyncio
 import re
@@ -62,12 +59,10 @@ class AlignmentMetrics:
         text = "For how long the oldest waiting alignment has waited; 0 without one."
         oldest = Gauge("dextouch_alignment_oldest_waiting_seconds", text, registry=registry)
         oldest.set_function(queue.oldest_waiting_s)
-        name, text = "dextouch_alignments_ended", "Alignments that ended."
-        self._ended = Counter(name, text, ("state",), registry=registry)
-        name, text = (
-            "dextouch_alignment_seconds",
-            "Duration of the last attempt of a done alignment.",
-        )
+        text = "Alignments that ended."
+        self._ended = Counter("dextouch_alignments_ended", text, ("state",), registry=registry)
+        name = "dextouch_alignment_seconds"
+        text = "Duration of the last attempt of a done alignment."
         self._seconds = Histogram(name, text, buckets=SECONDS, registry=registry)
         for state in ENDED:
             self._ended.labels(state)
@@ -80,11 +75,7 @@ class AlignmentMetrics:
 
 
 class JobRunner:
-    """The alignments of one store; asking again for the same one gives the same job.
-
-    Runs between `start` and `close`. All methods belong to one event loop. `queue` holds the jobs,
-    which are kept in `jobs_folder`; `metrics` shows them.
-    """
+    """The alignments of a store between `start` and `close`; jobs in `jobs_folder` resume."""
 
     def __init__(self, store: EpisodeStore, settings: AlignmentSettings) -> None:
         self._store, self._settings = store, settings
@@ -104,11 +95,7 @@ class JobRunner:
         self.is_warm = False
 
     async def start(self) -> None:
-        """Load the jobs on disk and start working on them.
-
-        While they cannot be opened the service runs without them: `queue.problem` says why, and
-        they are tried again every few seconds.
-        """
+        """Load the jobs on disk, every few seconds until they open, and work on them."""
         is_open = await self._open_queue()
         await self._sweep()
         work = [self._warm_up(), *(self._work(worker) for worker in self._workers)]
@@ -117,10 +104,7 @@ class JobRunner:
         self._tasks = [asyncio.create_task(one) for one in work]
 
     async def _open_queue(self) -> bool:
-        """Load the jobs on disk, and put those back that were running; whether that was possible.
-
-        The same failure is logged only once.
-        """
+        """Load the jobs on disk, and put running ones back; whether it worked."""
         before = self.queue.problem
         async with self._changed:
             try:
@@ -166,12 +150,8 @@ class JobRunner:
     async def submit(self, request: AlignmentRequest) -> tuple[AlignmentJob, ...]:
         """Submit alignments, or find those that run or are done; failed ones are submitted again.
 
-        All of them are accepted or none.
-
-        Raises:
-            NotFoundError: no such recording.
-            InvalidInputError: a recording lacks what every episode needs.
-            LimitExceededError: too many are waiting.
+        All are accepted or none. Raises NotFoundError: no such recording; InvalidInputError: it
+        lacks what every episode needs; LimitExceededError: too many are waiting.
         """
         options = request.options or self._options
         if options.objects is None:
@@ -187,12 +167,7 @@ class JobRunner:
         return tuple(self.queue.get(alignment_id) for alignment_id in ids.values())
 
     async def refuse(self, recording_id: str, error: InvalidInputError) -> None:
-        """Keep a failed job of a recording that cannot be aligned, so that its reason is listed.
-
-        Raises:
-            NotFoundError: no such recording.
-            LimitExceededError: too many are waiting.
-        """
+        """Keep a failed job with its reason; raises NotFoundError or LimitExceededError."""
         recording = await asyncio.to_thread(self._store.recording, recording_id)
         alignment_id = episode_id_of(recording, self._options)
         job = AlignmentJob.new(alignment_id, recording_id, self._options)
@@ -209,12 +184,7 @@ class JobRunner:
         return self.queue.get(alignment_id)
 
     async def cancel(self, alignment_id: str) -> AlignmentJob:
-        """Cancel an alignment that waits or runs; nothing of it is written.
-
-        Raises:
-            NotFoundError: not known here.
-            ConflictError: it is done or has failed.
-        """
+        """Cancel a job that waits or runs; raises NotFoundError, or ConflictError if done."""
         async with self._changed:
             job = self.queue.get(alignment_id)
             if job.state in {"done", "failed"}:
@@ -243,7 +213,6 @@ class JobRunner:
         self.is_warm = True
 
     async def _work(self, worker: AlignmentWorker) -> None:
-        """Run one job after another on one worker."""
         while True:
             try:
                 job = await self._take(worker)
@@ -258,7 +227,6 @@ class JobRunner:
                     del self._at_work[job.alignment_id]
 
     async def _take(self, worker: AlignmentWorker) -> AlignmentJob:
-        """Start the job that has waited longest, once there is one."""
         async with self._changed:
             waiting = await self._changed.wait_for(self.queue.next)
             assert waiting is not None  # noqa: S101 - what was waited for
@@ -312,12 +280,11 @@ class JobRunner:
 class NewRecordings:
     """Lists a store and submits a job for each recording that has no episode yet, once.
 
-    A recording is skipped when it has a job, in whatever state; when an episode
-    made from it is in the store or its trash, under any options; or when it is a calibration take.
-    One that cannot be aligned becomes a failed job with the reason; if the disk was full, it is
-    submitted again after RETRY_S. One that cannot be read is logged and tried again after RETRY_S.
-    One that comes back under the id of another that was deleted while this was watching counts as
-    new unless an episode was made from its content.
+    A recording is skipped when it has a job; when an episode made from it is in the store or its
+    trash, under any options; or when it is a calibration take. One that cannot be aligned becomes a
+    failed job with the reason; it is submitted again after RETRY_S if the disk was full, and one
+    that cannot be read is tried again. One that comes back under the id of a deleted one is new
+    unless an episode was made from its content.
     """
 
     def __init__(self, store: EpisodeStore, jobs: JobRunner) -> None:
@@ -346,11 +313,7 @@ class NewRecordings:
             await asyncio.sleep(period_s)
 
     async def look(self) -> None:
-        """Submit new recordings; a recording that finds no room in the queue is left for next time.
-
-        Raises:
-            StorageError: the store cannot be listed, or jobs cannot be kept.
-        """
+        """Submit new recordings as far as the queue has room; raises StorageError."""
         for job in self._jobs.queue.out_of_space(for_s=RETRY_S):
             again = AlignmentRequest(recording_id=job.recording_id, options=job.options)
             with suppress(InvalidInputError, LimitExceededError, NotFoundError):
@@ -370,14 +333,14 @@ class NewRecordings:
 
     def _new(self, listed: Sequence[str]) -> list[str]:
         """Recordings neither submitted nor skipped before, nor found unreadable just now."""
-        there = set(listed)
-        self._deleted |= self._seen - there
-        self._seen &= there
-        self._seen |= (self._jobs.queue.recording_ids & there) - self._deleted
-        self._unreadable = {k: found for k, found in self._unreadable.items() if k in there}
+        listed_ids = set(listed)
+        self._deleted |= self._seen - listed_ids
+        self._seen &= listed_ids
+        self._seen |= (self._jobs.queue.recording_ids & listed_ids) - self._deleted
+        self._unreadable = {k: found for k, found in self._unreadable.items() if k in listed_ids}
         since_s = time.monotonic() - RETRY_S
-        just_now = {k for k, (_, found_s) in self._unreadable.items() if found_s > since_s}
-        return [item for item in listed if item not in self._seen | just_now]
+        unreadable = {k for k, (_, found_s) in self._unreadable.items() if found_s > since_s}
+        return [item for item in listed if item not in self._seen | unreadable]
 
     async def _ask(self, recording_id: str, episode_ids: Sequence[str]) -> bool:
         """Submit a recording unless it is to be skipped; False if it cannot be read."""
@@ -420,7 +383,6 @@ def _aligned(store: EpisodeStore) -> dict[str, list[str]]:
 def _has_episode(
     store: EpisodeStore, recording: RecordingReader, episode_ids: Sequence[str]
 ) -> bool:
-    """Whether one of these episodes was made from the content of this recording."""
     for episode_id in episode_ids:
         # Of the trash, or damaged.
         with suppress(DexTouchError):

@@ -1,8 +1,4 @@
-"""Alignment of one recording into an episode of the same store, here or in a process of its own.
-
-With `AlignmentWorker` recordings are aligned side by side on several processors, and a process that
-is killed takes nothing but its own recording along.
-"""
+"""Alignment of one recording into an episode of the same store, here or in a process of its own."""
 
 import hashlib
 import sys
@@ -53,14 +49,10 @@ def align_recording(
 ) -> AlignmentReport:
     """Align one recording and write the episode.
 
-    The episode's id follows from the recording's content and the options: doing it again, even
-    from two processes at once, gives the same episode and writes nothing. Progress is told in the
-    caller's thread.
-
-    Raises:
-        NotFoundError: no such recording, or it was deleted meanwhile.
-        InvalidInputError: the recording lacks data that an episode needs (the message names it).
-        CorruptDataError, StorageError: the store's bytes are damaged or cannot be written.
+    The episode's id follows from the recording's content and the options: doing it again, even from
+    two processes at once, gives the same episode. Raises NotFoundError: no such recording, or it
+    was deleted meanwhile; InvalidInputError: it lacks data that an episode needs; CorruptDataError,
+    StorageError: the store's bytes are damaged or cannot be written.
     """
     recording = store.recording(recording_id)
     episode_id = episode_id_of(recording, options)
@@ -86,12 +78,7 @@ def align_recording(
 
 
 def check_recording(store: EpisodeStore, recording_id: str, options: AlignmentOptions) -> str:
-    """Check that a recording has the data that an episode needs; returns the id of its episode.
-
-    Raises:
-        NotFoundError: no such recording.
-        InvalidInputError: streams or calibration that every episode needs are missing.
-    """
+    """Id of the episode of a recording; raises NotFoundError, or InvalidInputError without data."""
     recording = store.recording(recording_id)
     check_complete(recording)
     return episode_id_of(recording, options)
@@ -100,12 +87,7 @@ def check_recording(store: EpisodeStore, recording_id: str, options: AlignmentOp
 def check_recordings(
     store: EpisodeStore, recording_ids: Sequence[str], options: AlignmentOptions
 ) -> dict[str, str]:
-    """Check several recordings; returns the id of each one's episode.
-
-    Raises:
-        NotFoundError: no such recording; of several, the message names all that are refused.
-        InvalidInputError: one lacks what every episode needs.
-    """
+    """Ids of the episodes of several; raises as `check_recording`, naming all that are refused."""
     episodes: dict[str, str] = {}
     refused: dict[str, DexTouchError] = {}
     for recording_id in recording_ids:
@@ -147,11 +129,7 @@ class AlignmentWorker:
         self._in_use = threading.RLock()
 
     def start(self) -> None:
-        """Start the process and wait until its solver is ready; does nothing if it runs.
-
-        Raises:
-            UnavailableError: it does not start.
-        """
+        """Start the process and wait until its solver is ready; raises UnavailableError."""
         with self._in_use:
             with self._guard:
                 if self._child is not None and self._child.is_running:
@@ -168,12 +146,7 @@ class AlignmentWorker:
     def run(
         self, recording_id: str, options: AlignmentOptions, on_progress: OnProgress
     ) -> AlignmentReport:
-        """Align a finished recording; its progress is told a few times a second.
-
-        Raises:
-            UnavailableError: the process was killed; the store is as it was.
-            DexTouchError: as `align_recording`.
-        """
+        """Align a recording; raises UnavailableError if killed, else as `align_recording`."""
         with self._in_use:
             self.start()
             child = self._child
@@ -201,7 +174,6 @@ class AlignmentWorker:
 
 
 def _write_streams(writer: EpisodeWriter, episode: BuiltEpisode, on_progress: OnProgress) -> None:
-    """Write the samples of every stream; empty streams are omitted."""
     num_streams = len(episode.streams)
     for number, stream in enumerate(episode.streams):
         name = stream.descriptor.name

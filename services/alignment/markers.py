@@ -1,10 +1,7 @@
 """Markers on objects: poses of the objects in images, and sheets of markers to print.
 
-An object's pose comes from its ArUco or AprilTag markers, as a camera of known pose sees them. That
-of a single square has two solutions that look almost alike when it is small or seen from the front
-(Schweighofer and Pinz, 2006; IPPE of Collins and Bartoli, 2014, gives both). The other markers of
-the object decide, or a clearly smaller error, or the pose that the object had in neighbouring
-images; where nothing decides, the object counts as not seen.
+A single square has two poses that look almost alike (Schweighofer and Pinz, 2006): other markers,
+a clearly smaller error, or neighbouring images decide.
 """
 
 from collections.abc import Iterator, Sequence
@@ -44,11 +41,7 @@ _EDGE_MM, _LABEL_MM = 12.0, 5.0
 
 @dataclass(frozen=True)
 class TrackedObject:
-    """Where an object was seen.
-
-    `t_ns` are the times of the images that show it, `Ts_world_object` its poses there and
-    `reprojection_px` the RMS distance between corners as found and as predicted by the pose.
-    """
+    """Poses of an object at the times of the images that show it, and its corners' RMS error."""
 
     t_ns: Int64[np.ndarray, " n"]
     Ts_world_object: Float64[np.ndarray, "n 4 4"]
@@ -64,10 +57,9 @@ class _Candidate:
 class MarkerDetector:
     """Finds markers of a dictionary in gray images, with unbiased corners.
 
-    Of OpenCV's ways to refine corners, only the lines that AprilTag's fits to the edges have no
-    bias: the corners of the others lie inside the marker, and with 30 to 40 px a side objects come
-    out 3 to 14 mm too far away. It searches whole images, which takes long where they are noisy, so
-    that it is given the surroundings of markers that were found without it.
+    Of OpenCV's ways to refine corners, only AprilTag's has no bias: others put objects with 30 to
+    40 px a side 3 to 14 mm too far away. It is slow, so that it is given the surroundings of found
+    markers.
     """
 
     def __init__(self, dictionary: MarkerDictionary) -> None:
@@ -78,10 +70,7 @@ class MarkerDetector:
         self._fine = cv2.aruco.ArucoDetector(kind, parameters)
 
     def find(self, gray: UInt8[np.ndarray, "h w"]) -> dict[int, list[Float64[np.ndarray, "4 2"]]]:
-        """Corners (px, the first pixel spans 0 … 1) of every marker, by its id.
-
-        Corners are in the order of OpenCV: upper left, upper right, lower right, lower left.
-        """
+        """Corners (px, the first pixel spans 0 … 1; from the upper left) of markers by id."""
         found: dict[int, list[np.ndarray]] = {}
         for number, corners in _detected(self._coarse, gray):
             refined = self._refined(gray, number, corners)
@@ -119,14 +108,7 @@ def _detected(
 
 
 class MarkerTracker:
-    """Finds the objects of one task in the images of a camera.
-
-    Args:
-        objects: of the task.
-        dictionary: of their markers.
-        K: of the camera, in px, pixel centres at half-integers.
-        distortion: k1 k2 p1 p2 k3.
-    """
+    """Finds a task's objects in images of a camera; K in px, pixel centres at half-integers."""
 
     def __init__(
         self,
@@ -219,8 +201,8 @@ def _decided(seen: Sequence[tuple[int, list[_Candidate]]]) -> TrackedObject:
         step = 1 if order.step > 0 else -1
         for index in order:
             near = chosen[index - step]
-            apart_ns = abs(seen[index][0] - seen[index - step][0])
-            if chosen[index] is None and near is not None and apart_ns <= _MAX_APART_NS:
+            gap_ns = abs(seen[index][0] - seen[index - step][0])
+            if chosen[index] is None and near is not None and gap_ns <= _MAX_APART_NS:
                 chosen[index] = _nearest(seen[index][1], near)
     taken = [(t_ns, one) for (t_ns, _), one in zip(seen, chosen, strict=True) if one is not None]
     taken = [one for index, one in enumerate(taken) if not _jumps(taken, index)]
@@ -262,13 +244,7 @@ def _nearest(candidates: Sequence[_Candidate], near: _Candidate) -> _Candidate |
 
 
 def marker_sheet(objects: SceneObjects) -> str:
-    """SVG with the markers of all objects on A4 pages below one another.
-
-    Every marker has a dashed line to cut along, and below it the object, its id and side.
-
-    Raises:
-        InvalidInputError: there is no marker, or one is larger than the page.
-    """
+    """SVG with all markers on A4 pages; raises InvalidInputError for none, or one too large."""
     printed = {
         (one.name, marker.id, marker.size_m): marker
         for listed in objects.tasks.values()

@@ -35,10 +35,9 @@ CLEARLY_BETTER = 0.5
 
 @dataclass(frozen=True)
 class Match:
-    """Correspondence of the samples of a stream with the true ones.
+    """Matched samples of a stream and the true ones; `offset_ns` is episode minus true time.
 
-    `offset_ns` is episode time minus true time of each pair; `num_dropped` true samples between
-    the first and the last pair have none.
+    `num_dropped` true samples between the first and the last pair have none.
     """
 
     index: Int64[np.ndarray, " n"]
@@ -57,20 +56,11 @@ def compare_with_truth(
 ) -> dict[str, Any]:
     """Errors of an episode against the truth episode that its mock devices replayed.
 
-    Args:
-        episode: made by alignment from the recording of the replay.
-        truth: the replayed episode.
-        origin_in_truth_ns: true time of the episode's time 0.
-
-    Returns:
-        `clock_rms_ms` {stream: ms} without each stream's constant delay; `latency_ms` {stream:
-        the delay, calibrated plus found}; `latency_error_ms` {stream: what calibration left};
-        `num_dropped` {stream}; `taxel_iou` and `taxel_mae_kpa` over samples that arrived (None
-        without gloves); `fingertip_error_mm`, `wrist_error_mm`, `wrist_error_deg`, means over
-        the model grid.
-
-    Raises:
-        InvalidInputError: the two share no stream.
+    `origin_in_truth_ns` is the true time of the episode's time 0. By stream are `clock_rms_ms`
+    without a constant delay, `latency_ms` (calibrated plus found), `latency_error_ms` (what
+    calibration left) and `num_dropped`; `taxel_iou` and `taxel_mae_kpa` are over samples that
+    arrived (None without gloves), `fingertip_error_mm`, `wrist_error_mm`, `wrist_error_deg` means
+    over the model grid. It raises InvalidInputError if the two share no stream.
     """
     origin_ns = origin_in_truth_ns
     matches = match_streams(episode, truth, origin_ns)
@@ -126,11 +116,7 @@ def match_streams(
 def match_samples(
     mine: StreamData, true: StreamData, origin_ns: int, reach_ns: int, *, period_ns: int
 ) -> Match:
-    """Match every sample with its true one, near in time and of similar values.
-
-    A constant delay may be longer than a period, so shifts by whole periods, up to `reach_ns`, are
-    tried too, and used if the values then match clearly better.
-    """
+    """Match samples with true ones, shifted by periods up to `reach_ns` where clearly better."""
     num = round(reach_ns / period_ns)
     shifts_ns = [origin_ns + period_ns * shift for shift in sorted(range(-num, num + 1), key=abs)]
     differences = np.array([_difference(mine, true, shift_ns, period_ns) for shift_ns in shifts_ns])
@@ -167,7 +153,6 @@ def _difference(mine: StreamData, true: StreamData, shift_ns: int, period_ns: in
 def _taxel_errors(
     gloves: Iterable[tuple[np.ndarray, np.ndarray]], layout: TactileLayout
 ) -> dict[str, float | None]:
-    """Errors over pressures of all gloves, each beside the true ones."""
     pairs = list(gloves)
     if not pairs:
         return {"taxel_iou": None, "taxel_mae_kpa": None}
@@ -212,7 +197,6 @@ def _placed(truth: EpisodeReader, name: str, at_ns: np.ndarray) -> tuple[np.ndar
 def _true_joints(
     truth: EpisodeReader, side: Side, at_ns: np.ndarray
 ) -> tuple[Float64[np.ndarray, "n 20"], Bool[np.ndarray, " n"]]:
-    """The robot's joints, or those retargeted from the true human hand."""
     if "joints_measured" not in truth.streams:
         keypoints, at = _placed(truth, f"keypoints_{side}", at_ns)
         return HandRetargeter(side).retarget(vectors_on_grid(keypoints, at)).joints_rad, at.valid

@@ -153,10 +153,7 @@ class AlignmentJob(FrozenModel):
         return self._with(state="waiting", attempts=attempts, progress=0.0, **again)
 
     def crashed(self, *, max_attempts: int) -> "AlignmentJob":
-        """The service died during this attempt: wait for the next one, or fail if it was the last.
-
-        The job itself may be what kills the service, so it is not tried for ever.
-        """
+        """The service died in this attempt: wait for the next, or fail if it was the last."""
         if self.attempts < max_attempts:
             return self.waiting(attempts=self.attempts)
         error = UnavailableError(
@@ -222,7 +219,6 @@ def report_of(episode: EpisodeReader, *, recording_id: str, created: bool) -> Al
 
 
 def _refused_taxels(calibration: Mapping[str, Matrix]) -> dict[str, dict[str, tuple[int, ...]]]:
-    """By stream and reason."""
     found: dict[str, dict[str, tuple[int, ...]]] = {}
     for name in ("tactile_left", "tactile_right"):
         states = np.array(calibration.get(f"{name}_refused_taxels", ()), dtype=np.int64).ravel()

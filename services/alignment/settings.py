@@ -11,7 +11,7 @@ from pydantic import Field, SecretStr
 from dextouch.command_line import RAY_HELP, CommandParser, add_json, positive
 from dextouch.data_folder import data_folder, default_spool, default_store
 from dextouch.frozen_model import FrozenModel
-from dextouch.schemas import SceneObjects, load_scene_objects
+from dextouch.schemas import SceneObjects
 from dextouch.serving import ServiceSettings, load_settings, service_config
 
 WristChoice = Literal["tracked", "touch"]
@@ -155,14 +155,10 @@ class AlignmentSettings(ServiceSettings):
 
     @cached_property
     def wanted_options(self) -> AlignmentOptions:
-        """The options, with the objects of the file.
-
-        Raises:
-            NotFoundError, InvalidInputError: as `load_scene_objects`.
-        """
+        """The options, with the objects of the file; raises as `SceneObjects.load`."""
         if self.objects is None:
             return self.options
-        return self.options.model_copy(update={"objects": load_scene_objects(self.objects)})
+        return self.options.model_copy(update={"objects": SceneObjects.load(self.objects)})
 
     @property
     def period_s(self) -> float:

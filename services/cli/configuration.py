@@ -72,7 +72,6 @@ def apply_configuration() -> None:
     """Use the data folder of the configuration file, and refuse sections that no command has.
 
     The folder is relative to the file; the environment variable DEXTOUCH_DATA comes before it.
-    Raises InvalidInputError for an unknown section, or an unreadable file.
     """
     path = serving.configuration_path()
     if path is None:
@@ -104,7 +103,7 @@ def effective_settings(section: str) -> list[Setting]:
     path = serving.configuration_path()
     in_file = dict(_leaves(serving.file_source(kind)[0]())) if serving.file_source(kind) else {}
     in_environment = dict(_leaves(EnvSettingsSource(kind)()))
-    known = dict(_defaults(kind))
+    known = {one.keys: one.value for one in _defaults(kind)}
     prefix = str(kind.model_config.get("env_prefix"))
     found = []
     for keys in sorted(known | in_file | in_environment, key=lambda keys: _place(kind, keys)):
@@ -137,11 +136,11 @@ def example(sections: Sequence[str]) -> str:
         kind = settings_class(section)
         lines += ["", f"[{section}]"]
         tables: dict[tuple[str, ...], list[str]] = {(): []}
-        for keys, value in _defaults(kind):
+        for keys, value, about in _defaults(kind):
             is_given = value is not None and value != REQUIRED
             tables.setdefault(keys[:-1], []).extend(
                 [
-                    *textwrap.wrap(f"# {_description(kind, keys)}", 100, subsequent_indent="# "),
+                    *textwrap.wrap(f"# {about}", 100, subsequent_indent="# "),
                     f"#{keys[-1]} = {toml_text(value) if is_given else '…'}",
                 ]
             )
@@ -169,35 +168,26 @@ def _leaves(values: Mapping[str, Any], above: tuple[str, ...] = ()) -> Iterator[
 
 
 def _defaults(
-    kind: type[BaseModel], given: BaseModel | None = None, above: tuple[str, ...] = ()
-) -> Iterator[tuple[tuple[str, ...], Any]]:
-    """Defaults of all settings, also of nested ones."""
+    kind: type[BaseModel], given: BaseModel | None = None, above: Setting | None = None
+) -> Iterator[Setting]:
+    """Defaults of all settings, also of nested ones, with descriptions in place of origins."""
     for name, field in kind.model_fields.items():
-        keys = (*above, field.alias or name)
+        keys = (*(above.keys if above else ()), field.alias or name)
         value = field.get_default(call_default_factory=True, validated_data={})
         if given is not None:
             value = getattr(given, name)
         elif value is PydanticUndefined:
             value = REQUIRED
+        about = field.description or (above.origin if above else "")
         if isinstance(value, BaseModel):
-            yield from _defaults(type(value), value, keys)
+            yield from _defaults(type(value), value, Setting(keys, value, about))
         else:
-            yield keys, to_jsonable_python(value, fallback=str)
+            yield Setting(keys, to_jsonable_python(value, fallback=str), about)
 
 
 def _place(kind: type[BaseModel], keys: tuple[str, ...]) -> tuple[int, tuple[str, ...]]:
-    """Order of a setting: as it is declared."""
     names = [field.alias or name for name, field in kind.model_fields.items()]
     return (names.index(keys[0]) if keys[0] in names else len(names)), keys
-
-
-def _description(kind: type[BaseModel], keys: tuple[str, ...]) -> str:
-    for name, field in kind.model_fields.items():
-        if keys[0] == (field.alias or name):
-            inner = [one for one in _models_in(field.annotation) if len(keys) > 1]
-            texts = [text for one in inner if (text := _description(one, keys[1:]))]
-            return texts[0] if texts else (field.description or "")
-    return ""
 
 
 def _models_in(annotation: object) -> Iterator[type[BaseModel]]:
@@ -208,7 +198,6 @@ def _models_in(annotation: object) -> Iterator[type[BaseModel]]:
 
 
 def _secret_names(kind: type[BaseModel]) -> set[str]:
-    """Names of fields that hold secrets, at any depth."""
     found = set()
     for name, field in kind.model_fields.items():
         if field.annotation is SecretStr or SecretStr in get_args(field.annotation):

@@ -1,8 +1,4 @@
-"""Command `dextouch doctor`: checks what this machine can do and what is missing.
-
-The machine is read below a root folder, so that tests give a tree of their own. Each finding that
-is not in order has the command that puts it right.
-"""
+"""Command `dextouch doctor`: checks what this machine can do, and says what puts it right."""
 
 import ctypes.util
 import importlib.metadata
@@ -159,7 +155,6 @@ class Machine:
             return None
 
     def _devices(self) -> list[Finding]:
-        """Which devices there are, and whether they may be opened."""
         findings, dev = [], self.root / "dev"
         access = (
             f"sudo install -m 644 {self.rules} /etc/udev/rules.d/ && "
@@ -229,7 +224,6 @@ class Machine:
         return [_advice("free memory", found, do)]
 
     def _gpu(self) -> Finding:
-        """NVIDIA graphics cards, and whether their driver runs."""
         what = "GPU (optional)"
         if self._text("proc/driver/nvidia/version") is not None:
             files = sorted((self.root / "proc/driver/nvidia/gpus").glob("*/information"))
@@ -342,7 +336,6 @@ def _loaded_opencv() -> tuple[str, str] | None:
 
 
 def _optional(name: str, purpose: str) -> Finding:
-    """A package that only one purpose needs; it is in order to do without."""
     what = f"{name} (optional, {purpose})"
     found = _package(name, purpose)
     return Finding(what, found.found if found.ok else f"no: {found.do}")
@@ -359,7 +352,6 @@ def _package(name: str, purpose: str) -> Finding:
 
 
 def _outdated() -> list[Finding]:
-    """Installed packages of other versions than dextouch-wm asks for."""
     try:
         from packaging.requirements import Requirement
 

@@ -1,13 +1,12 @@
 """Commands that enrol stations at an episode store, list them, and revoke their keys."""
 
-import argparse
 import json
 import os
 from collections.abc import Sequence
 from contextlib import closing
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, TypeVar
+from typing import Final, TypeVar
 from urllib.parse import quote
 
 from pydantic import BaseModel, SecretStr, ValidationError
@@ -15,9 +14,6 @@ from pydantic import BaseModel, SecretStr, ValidationError
 from dextouch.command_line import CommandParser, add_json, write_result
 from dextouch.data_folder import default_enrolment
 from dextouch.errors import UnavailableError
-
-if TYPE_CHECKING:
-    from dextouch.clients import HttpLink
 
 FormT = TypeVar("FormT", bound=BaseModel)
 KEY_VARIABLE: Final = "DEXTOUCH_KEY"
@@ -44,14 +40,12 @@ def station_enrol_main(argv: Sequence[str]) -> int:
     )
     add_json(parser)
     options = parser.parse_args(list(argv))
-    from dextouch.clients import HttpLink
     from dextouch.schemas import StationKey
     from services.acquisition.settings import Enrolment, check_writable, write_enrolment
 
     path, url = options.output or default_enrolment(), options.url.rstrip("/")
     check_writable(path)
-    with closing(HttpLink(url)) as link:
-        got = _ask(link, StationKey, "POST", f"{PATH}/exchange", {"token": options.token})
+    got = _ask(StationKey, "POST", f"{PATH}/exchange", url=url, body={"token": options.token})
     write_enrolment(
         path,
         Enrolment(station=got.station, episode_store_url=url, episode_store_key=SecretStr(got.key)),
@@ -78,10 +72,8 @@ def store_enrol_main(argv: Sequence[str]) -> int:
     options = parser.parse_args(list(argv))
     from dextouch.schemas import EnrolmentToken
 
-    with _link(options) as link:
-        got = _ask(
-            link, EnrolmentToken, "POST", PATH, {"station": options.station, "renew": options.renew}
-        )
+    body = {"station": options.station, "renew": options.renew}
+    got = _ask(EnrolmentToken, "POST", PATH, url=options.url, key=options.key, body=body)
     command = f"dextouch station enrol {options.url} {got.token}"
     print(f"run this on {got.station}, once, before {_shown(got.expires_at)}:\n\n  {command}\n")
     write_result(options.json, got.model_dump(mode="json") | {"command": command})
@@ -94,8 +86,7 @@ def store_stations_main(argv: Sequence[str]) -> int:
     options = parser.parse_args(list(argv))
     from dextouch.schemas import StationEnrolments
 
-    with _link(options) as link:
-        listed = _ask(link, StationEnrolments, "GET", PATH)
+    listed = _ask(StationEnrolments, "GET", PATH, url=options.url, key=options.key)
     for one in listed.enrolments:
         ended = one.revoked_at or one.enrolled_at or one.requested_at
         print(f"{one.station:<32}  {one.state:<8}  since {_shown(ended)}  {one.enrolled_from}")
@@ -116,8 +107,7 @@ def store_revoke_main(argv: Sequence[str]) -> int:
 
     query = "?former=true" if options.former else ""
     path = f"{PATH}/{quote(options.station, safe='')}/revoke{query}"
-    with _link(options) as link:
-        listed = _ask(link, StationEnrolments, "POST", path)
+    listed = _ask(StationEnrolments, "POST", path, url=options.url, key=options.key)
     print(f"revoked: {options.station}{' (former keys)' * options.former}")
     write_result(options.json, listed.model_dump(mode="json"))
     return 0
@@ -137,26 +127,27 @@ def _administration(name: str, does: str, usual: str = "") -> CommandParser:
     parser.add_argument(
         "--key",
         metavar="KEY",
+        default=os.environ.get(KEY_VARIABLE),
         help=f"API key with the scope enrol (default: the variable {KEY_VARIABLE})",
     )
     add_json(parser)
     return parser
 
 
-def _link(options: argparse.Namespace) -> "closing[HttpLink]":
-    from dextouch.clients import HttpLink
-
-    return closing(HttpLink(options.url, api_key=options.key or os.environ.get(KEY_VARIABLE)))
-
-
 def _ask(
-    link: "HttpLink",
     form: type[FormT],
     method: str,
     path: str,
+    *,
+    url: str,
+    key: str | None = None,
     body: dict[str, str | bool] | None = None,
 ) -> FormT:
-    reply = link.request(method, path, body=None if body is None else json.dumps(body).encode())
+    from dextouch.clients import HttpLink
+
+    content = None if body is None else json.dumps(body).encode()
+    with closing(HttpLink(url, api_key=key)) as link:
+        reply = link.request(method, path, body=content)
     try:
         return form.model_validate_json(reply.body)
     except ValidationError as error:

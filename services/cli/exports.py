@@ -200,7 +200,6 @@ def _export(options: argparse.Namespace) -> Report:
 
 
 def _paths(ids: Sequence[str], options: argparse.Namespace) -> dict[str, Path]:
-    """Files by id: the one that was named for one id, otherwise files in a folder."""
     to, form = options.to, options.format
     paths = {item_id: to / f"{item_id}.{form}" for item_id in ids}
     if to.suffix == f".{form}":
@@ -217,7 +216,6 @@ def _paths(ids: Sequence[str], options: argparse.Namespace) -> dict[str, Path]:
 
 
 def _end_mcap(exported: Sequence[Attributes], options: argparse.Namespace) -> Report:
-    """Say which files have no dates, and write the layout for Foxglove where there is to be one."""
     from dextouch.bridges.foxglove import write_layout
     from dextouch.bridges.mcap import has_wall_times
 

@@ -4,6 +4,7 @@ import argparse
 import importlib
 import os
 import sys
+import tomllib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,12 +18,7 @@ from services.cli.standard_streams import StandardStreams
 
 
 class Command(NamedTuple):
-    """A command: its summary, and `module:function` of `services`; a bare group has none.
-
-    Its help imports nothing else than `flags`: the section of its settings, `module:NAME_parser`,
-    which makes its parser, or `module:NAME_settings`, which finds the class of its settings from
-    the arguments.
-    """
+    """A command: its summary, what runs it, and what its help needs (commands.toml)."""
 
     does: str
     target: str = ""
@@ -30,165 +26,10 @@ class Command(NamedTuple):
 
 
 COMMANDS = {
-    "demo": Command(
-        "record, align, predict and evaluate on this machine",
-        "pipelines.demo:main",
-        "pipelines.parsers:demo_parser",
-    ),
-    "up": Command("run every service in one process, with a dashboard", "cli.up:main", "up"),
-    "doctor": Command("check what this machine can do and what is missing", "cli.doctor:main"),
-    "twin": Command(
-        "record ground-truth episodes in the physics twin, or serve it",
-        "twin.command_line:main",
-        "twin.parser:twin_parser",
-    ),
-    "twin serve": Command("serve rollouts in the twin", "twin.world:serve", "twin"),
-    "station": Command("record and calibrate a station's devices"),
-    "station serve": Command(
-        "record gloves, trackers and cameras", "pipelines.station:main", "acquisition"
-    ),
-    "station bridge": Command(
-        "serve samples of other makers' trackers and programs to stations",
-        "acquisition.sdk_bridges.command_line:main",
-        "acquisition.sdk_bridges.parser:bridge_parser",
-    ),
-    "station enrol": Command(
-        "exchange a one-time token for the station's key of the store",
-        "cli.enrolment:station_enrol_main",
-    ),
-    "station calibrate": Command(
-        "calibrate gloves, cameras and latencies", "pipelines.calibrate:main"
-    ),
-    "store": Command(
-        "list, show, verify, clicks, note, trim, relabel, merge, repair, delete, …",
-        "episode_store.command_line:main",
-        "episode_store.parser:store_parser",
-    ),
-    "store serve": Command("serve the store over HTTP", "episode_store.app:main", "episode_store"),
-    "store enrol": Command(
-        "get a one-time token with which a station gets its key", "cli.enrolment:store_enrol_main"
-    ),
-    "store stations": Command("list enrolled stations", "cli.enrolment:store_stations_main"),
-    "store revoke": Command(
-        "revoke the key of an enrolled station", "cli.enrolment:store_revoke_main"
-    ),
-    "export": Command(
-        "write LeRobot, MCAP, Rerun or UMI files from a store",
-        "cli.exports:export_main",
-        "pipelines.parsers:export_parser",
-    ),
-    "import": Command(
-        "read LeRobot, MCAP or Rerun files into a store",
-        "cli.exports:import_main",
-        "pipelines.parsers:import_parser",
-    ),
-    "align": Command(
-        "convert recordings to synchronized episodes",
-        "alignment.command_line:main",
-        "alignment.settings:default_parser",
-    ),
-    "align serve": Command("serve alignment over HTTP", "alignment.app:main", "alignment"),
-    "teleop": Command("follow a tracked hand live with a robot hand"),
-    "teleop serve": Command(
-        "serve commands for a robot hand that follows a tracked one",
-        "pipelines.teleoperation.app:main",
-        "teleoperation",
-    ),
-    "train": Command("train the world model, its success classifier, or a policy"),
-    "train data": Command(
-        "record training episodes in the twin",
-        "pipelines.training_data:main",
-        "pipelines.parsers:training_data_parser",
-    ),
-    "train tokenizer": Command(
-        "train a tactile tokenizer for the paper's form of the world model",
-        "pipelines.train_tokenizer:main",
-        "world_model_train_tokenizer",
-    ),
-    "train world-model": Command(
-        "train a world model on episodes of robots and people, of either form",
-        "world_model.command_line:run_train",
-        "world_model.paper_settings:train_settings",
-    ),
-    "train distill": Command(
-        "train a world model in the paper's form to sample in few steps",
-        "world_model.command_line:run_distill",
-        "world_model_distill",
-    ),
-    "train adapt": Command(
-        "adapt a world model of either form to new tasks",
-        "world_model.command_line:run_adapt",
-        "world_model.paper_settings:adapt_settings",
-    ),
-    "train imagined": Command(
-        "predict the episodes of a store with the world model",
-        "pipelines.imagined_data:imagined_main",
-        "pipelines.parsers:imagined_parser",
-    ),
-    "train policy": Command(
-        "train a policy on demonstrations",
-        "pipelines.place_policy:run_train_policy",
-        "evaluation_train_policy",
-    ),
-    "train judge": Command(
-        "train the success classifier on true and imagined episodes",
-        "evaluation.command_line:run_train_judge",
-        "evaluation_train_probe",
-    ),
-    "generate": Command(
-        "generate demonstrations from the actions of recorded ones",
-        "pipelines.imagined_data:generate_main",
-        "pipelines.parsers:generate_parser",
-    ),
-    "checkpoint": Command(
-        "show the provenance and accuracy of a world model",
-        "world_model.command_line:run_show",
-        "world_model_show",
-    ),
-    "serve": Command(
-        "serve the world model's rollouts", "world_model.command_line:run_serve", "world_model"
-    ),
-    "evaluate": Command(
-        "score policies in real and imagined worlds",
-        "evaluation.command_line:run_evaluation",
-        "evaluation_run",
-    ),
-    "evaluate prediction": Command(
-        "measure predicted images and touch on held-out episodes",
-        "pipelines.evaluate:prediction_main",
-        "pipelines.parsers:prediction_parser",
-    ),
-    "evaluate recorded": Command(
-        "score policies from recorded first observations, and how far to trust it",
-        "pipelines.evaluate:recorded_main",
-        "pipelines.parsers:recorded_parser",
-    ),
-    "study": Command(
-        "score policies in several worlds, defined in a file and resumable",
-        "pipelines.study:main",
-        "pipelines.parsers:study_parser",
-    ),
-    "study serve": Command(
-        "serve the results of studies to the dashboard", "evaluation.studies.app:main", "studies"
-    ),
-    "rate": Command("score rollouts by human raters, and measure their agreement"),
-    "rate serve": Command(
-        "serve the page on which raters mark rollouts", "evaluation.rating.app:main", "rating"
-    ),
-    "rate report": Command(
-        "print scores and the agreement of raters",
-        "evaluation.rating.command_line:report_main",
-        "rating_report",
-    ),
-    "dashboard": Command("serve the operators' page", "dashboard.app:main", "dashboard"),
-    "config": Command("show the effective settings, or an example of dextouch.toml"),
-    "config show": Command(
-        "show the effective settings and where each comes from", "cli.configuration:show_main"
-    ),
-    "config example": Command(
-        "print a dextouch.toml with all settings", "cli.configuration:example_main"
-    ),
-    "completion": Command("print the completion script of a shell", "cli.completion:main"),
+    name: Command(**one)
+    for name, one in tomllib.loads(
+        Path(__file__).with_name("commands.toml").read_text(encoding="utf-8")
+    ).items()
 }
 
 EXIT_USAGE = 2  # as argparse
@@ -258,7 +99,6 @@ def _found(place: str) -> Any:  # noqa: ANN401 - functions and classes
 
 
 def _show_help(flags: str, arguments: list[str]) -> None:
-    """Print the help of a command, and exit."""
     from dextouch.serving import load_settings
     from services.cli.configuration import SECTIONS
 
@@ -271,11 +111,10 @@ def _show_help(flags: str, arguments: list[str]) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command.
+    """Run one command and return its exit status.
 
-    Returns:
-        Its exit status; 1 if standard output cannot be written, 2 for an unknown command, 3 for a
-        refusal with its reason on stderr, 141 if nobody reads the output any more (`| head`).
+    It is 1 if standard output cannot be written, 2 for an unknown command, 3 for a refusal with its
+    reason on stderr, 141 if nobody reads the output any more (`| head`).
     """
     words = list(sys.argv[1:] if argv is None else argv)
     streams = StandardStreams()

@@ -237,11 +237,8 @@ def held_data_folder(folder: Path) -> Iterator[Callable[[str], None]]:
     """Context manager that holds the lock of a data folder, which is created if needed.
 
     It yields a function by which the file tells others the address of the dashboard. The kernel
-    releases the lock when the process ends, however it does.
-
-    Raises:
-        ConflictError: another process holds it.
-        StorageError: the folder cannot be created or written.
+    releases the lock when the process ends, however it does. Raises ConflictError if another
+    process holds it, and StorageError if the folder cannot be created or written.
     """
     path = folder / LOCK_FILE
     with disk_errors(

@@ -1,10 +1,4 @@
-"""Audit log of the dashboard: who changed what and when, as JSON lines in files that rotate.
-
-A middleware writes an entry for every request that changes something. Of a request it keeps names
-of items and actions, never its body, query or headers. A line is on the disk before the browser
-learns the result. Lines of people without a session (refused sign-ins) rotate in files of their
-own, so that they cannot displace the others.
-"""
+"""Audit log of the dashboard: who changed what and when, as JSON lines in files that rotate."""
 
 import heapq
 import json
@@ -25,13 +19,14 @@ from starlette.requests import HTTPConnection
 from starlette.routing import compile_path
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from dextouch.episodes import sync_folder, write_parts
 from dextouch.errors import DexTouchError, InvalidInputError
 from dextouch.frozen_model import FrozenModel
 from dextouch.schemas import StationEnrolments
 from dextouch.serving import masked
 from services.dashboard.feeds import ACTIONS as RECORDER_ACTIONS
 from services.dashboard.pages import Sessions
-from services.dashboard.upstream import Upstream
+from services.dashboard.upstream import FORWARDED, Upstream
 
 logger = structlog.get_logger(__name__)
 
@@ -51,32 +46,11 @@ ACTIONS: Final[Mapping[str, str]] = {
     "/sign_out": "sign out",
     "/v1/recorder/{action}": "recorder",
     "/v1/uploads/{recording_id}/retry": "send upload again",
-    "/v1/acquisition/faults/{fault}": "simulate fault",
     "/v1/comparisons": "start replay",
     "/v1/comparisons/stop": "stop replay",
     # Several a second; that they began is noted.
     "/v1/comparisons/{comparison_id}/moves": "",
-    "/v1/episode_store/catalog/reviews": "review",
-    "/v1/episode_store/episodes/{item_id}/clicks": "mark objects",
-    "/v1/episode_store/episodes/{item_id}/trim": "trim",
-    "/v1/episode_store/catalog/relabel": "relabel",
-    "/v1/episode_store/notes/{kind}/{item_id}": "add note",
-    "/v1/episode_store/notes/{kind}/{item_id}/remove": "remove note",
-    "/v1/episode_store/downloads": "download",
-    "/v1/episode_store/trash": "delete",
-    "/v1/episode_store/trash/restore": "restore",
-    "/v1/episode_store/enrolments": "enrol station",
-    "/v1/episode_store/enrolments/{station}/revoke": "revoke station",
-    "/v1/alignment/alignments": "align",
-    "/v1/alignment/alignments/{alignment_id}/cancel": "cancel alignment",
-    "/v1/alignment/calibration/runs": "start calibration",
-    "/v1/alignment/calibration/run/answer": "answer calibration",
-    "/v1/alignment/calibration/run/take": "keep calibration place",
-    "/v1/alignment/calibration/run/drop": "drop calibration place",
-    "/v1/alignment/calibration/run/finish": "finish calibration",
-    "/v1/alignment/calibration/run/cancel": "cancel calibration",
-    "/v1/alignment/calibration/practice/start": "start practice devices",
-    "/v1/alignment/calibration/practice/stop": "stop practice devices",
+    **{f"/v1/{one.service}{one.path}": one.action for one in FORWARDED if one.action},
 }
 OF_STATION: Final = ("/v1/recorder/", "/v1/uploads/")
 # Fields of bodies that name what is changed, or how; all others may be private.
@@ -154,19 +128,13 @@ class RotatedLines:
         try:
             size = os.fstat(descriptor).st_size
             is_torn = size > 0 and os.pread(descriptor, 1, size - 1) != b"\n"
-            rest = memoryview((b"\n" if is_torn else b"") + line + b"\n")
-            while rest:
-                rest = rest[os.write(descriptor, rest) :]
+            write_parts(descriptor, b"\n" if is_torn else b"", line, b"\n")
             if self._sync:
                 os.fsync(descriptor)
         finally:
             os.close(descriptor)
         if is_new and self._sync:
-            descriptor = os.open(self._folder, os.O_RDONLY)
-            try:
-                os.fsync(descriptor)
-            finally:
-                os.close(descriptor)
+            sync_folder(self._folder)
 
     def _path(self, number: int) -> Path:
         return self._folder / f"{self._name}-{number:09}.jsonl"
@@ -182,7 +150,10 @@ class RotatedLines:
 
 
 class AuditLog:
-    """Entries of the requests that change something, in a folder or in memory; thread-safe."""
+    """Entries of the requests that change something, in a folder or in memory; thread-safe.
+
+    Those without a session rotate in files of their own, so that they cannot displace the others.
+    """
 
     def __init__(self, folder: Path | None, *, max_bytes: int) -> None:
         self.folder = folder
@@ -271,7 +242,10 @@ def _prepare(folder: Path) -> None:
 
 
 class AuditTrail:
-    """Middleware that writes an entry before the response to a request begins."""
+    """Middleware that writes an entry before the response to a request begins.
+
+    Of a request it keeps names of items and actions, never its body, query or headers.
+    """
 
     def __init__(self, app: ASGIApp, *, log: AuditLog, sessions: Sessions, station: str) -> None:
         self._app, self._log, self._sessions, self._station = app, log, sessions, station

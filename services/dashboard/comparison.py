@@ -108,7 +108,7 @@ class Comparisons:
         """The running or newest comparison."""
         return self._run.view
 
-    async def start(self, asked: StartComparison) -> ComparisonView:
+    async def start(self, request: StartComparison) -> ComparisonView:
         """Replay an episode of the store, or begin with hands that wait to be moved.
 
         Raises:
@@ -117,9 +117,9 @@ class Comparisons:
             UnavailableError: a service does not answer.
         """
         imagined = await self._world("imagined")
-        actions, real, view = None, None, ComparisonView(task=asked.task, seed=asked.seed)
-        if asked.episode_id:
-            about, actions = await self._episode(asked.episode_id)
+        actions, real, view = None, None, ComparisonView(task=request.task, seed=request.seed)
+        if request.episode_id:
+            about, actions = await self._episode(request.episode_id)
             known = ("episode_id", "task", "instruction")
             changes: dict[str, Any] = {name: getattr(about, name) for name in known}
             view = view.model_copy(update=changes | {"seed": about.seed or 0})
@@ -134,7 +134,7 @@ class Comparisons:
         allowed = (most if actions is None else min(most, len(actions))) // chunk * chunk
         if actions is not None and not allowed:
             raise InvalidInputError(
-                f"episode {asked.episode_id!r}: got {len(actions)} actions, expected at least "
+                f"episode {request.episode_id!r}: got {len(actions)} actions, expected at least "
                 f"{chunk}"
             )
         changes = {
@@ -279,25 +279,16 @@ class Comparisons:
         """Add the steps of a chunk: their errors to the view, their images for the page."""
         added, message = await asyncio.to_thread(compared, real, imagined)
         run.messages.append(message)
-        view = run.view
-        joined = {name: getattr(view, name) + values for name, values in added.items()}
-        unreliable = ChunkUncertainty(
-            first_step=real.first_step,
-            last_step=real.first_step + len(real) - 1,
-            uncertainty=imagined.uncertainty,
-            bound_share=bound_share,
-        )
-        run.view = view.model_copy(
-            update=joined
-            | {
-                "num_chunks": len(run.messages),
-                "real_success": real.success,
-                # The start is given, not imagined.
-                "uncertainties": (*view.uncertainties, unreliable)
-                if real.first_step
-                else view.uncertainties,
-            }
-        )
+        changes = {name: getattr(run.view, name) + values for name, values in added.items()}
+        changes |= {"num_chunks": len(run.messages), "real_success": real.success}
+        # The start is given, not imagined.
+        if real.first_step:
+            steps = {"first_step": real.first_step, "last_step": real.last_step}
+            newest = ChunkUncertainty(
+                **steps, uncertainty=imagined.uncertainty, bound_share=bound_share
+            )
+            changes["uncertainties"] = (*run.view.uncertainties, newest)
+        run.view = run.view.model_copy(update=changes)
 
 
 async def _replayed(actions: np.ndarray, size: int) -> AsyncIterator[np.ndarray]:
@@ -337,10 +328,10 @@ def compared(
     guessed = imagined.images[HEAD_CAMERA]
     images = [fitted(real.images[HEAD_CAMERA], guessed.shape[1:3]), guessed]
     touch = [seen.tactile_kpa for seen in (real, imagined)]
-    apart = np.abs(images[0].astype(np.int16) - images[1])
+    difference = np.abs(images[0].astype(np.int16) - images[1])
     pairs = list(zip(*touch, strict=True))
     errors = {
-        "pixel_error": tuple(apart.mean(axis=(1, 2, 3)).tolist()),
+        "pixel_error": tuple(difference.mean(axis=(1, 2, 3)).tolist()),
         "pressure_error_kpa": tuple(
             tactile.mae(predicted_kpa=guess, true_kpa=truth) for truth, guess in pairs
         ),

@@ -65,7 +65,9 @@ class WorldSide:
     async def _post(self, path: str, kind: str, body: bytes) -> schemas.RolloutAnswer:
         headers = {"content-type": kind, "accept": MSGPACK, "dextouch-client": "dashboard"}
         path = f"{path}?{urlencode({'cameras': HEAD_CAMERA})}"
-        answer = await self.upstream.forward("POST", path, headers, body, timeout_s=WORLD_TIMEOUT_S)
+        answer = await self.upstream.send(
+            "POST", path, body, headers=headers, timeout_s=WORLD_TIMEOUT_S
+        )
         return schemas.decode_answer(answer.content, max_bytes=MAX_RESPONSE_BYTES)
 
 

@@ -1,8 +1,4 @@
-"""Panels of the page: what each shows, polled from the other services for all viewers.
-
-A new panel is a topic here with the function that fetches it, a section in
-`templates/station.html`, and a function in `static/` that `static/main.js` calls with the data.
-"""
+"""Panels of the page: what each shows, polled from the other services for all viewers."""
 
 import asyncio
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
@@ -64,7 +60,7 @@ def skeleton_bones() -> list[tuple[int, int]]:
 def heatmap_layout() -> dict[str, object]:
     """Positions of the taxels of `dextouch_v1` and the colour map, from `dextouch.tactile`.
 
-    Those of other gloves the page finds from their layout (`static/layouts.js`).
+    Those of other gloves the page finds from their layout (`static/taxels.js`).
     """
     layout = DEXTOUCH_V1
     taxels = np.arange(layout.num_taxels, dtype=np.float32)
@@ -435,7 +431,7 @@ class Feeds:
         """The service's list of studies, or why there is none."""
         try:
             studies = self.upstream("studies")
-            answer = await studies.forward("GET", "/v1/studies", {}, b"", timeout_s=STUDY_TIMEOUT_S)
+            answer = await studies.send("GET", "/v1/studies", timeout_s=STUDY_TIMEOUT_S)
             return answer.json()
         except DexTouchError as error:
             return {"studies": (), "note": error.message}

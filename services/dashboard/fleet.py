@@ -184,10 +184,10 @@ class Fleet:
     async def _messages(self) -> list[Message]:
         """The tiles, trouble first, and the pressures of each; slow stations are not waited for."""
         store = self.of().store
-        asked = [watched.ask() for watched in self._watched]
+        polls = [watched.ask() for watched in self._watched]
         if store is not None:
-            asked += [asyncio.create_task(one.ask_hours(store)) for one in self._watched]
-        await asyncio.wait(asked, timeout=self._period_s)
+            polls += [asyncio.create_task(one.ask_hours(store)) for one in self._watched]
+        await asyncio.wait(polls, timeout=self._period_s)
         tiles = [(watched.tile(), watched) for watched in self._watched]
         tiles.sort(key=lambda row: (ORDER.index(row[0].level), row[0].name))
         pressures = [one.taxel_message(index) for index, (_, one) in enumerate(tiles)]

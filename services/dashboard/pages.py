@@ -8,7 +8,7 @@ import sysconfig
 import time
 import tomllib
 from asyncio import to_thread
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable
 from dataclasses import KW_ONLY, dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
@@ -39,26 +39,18 @@ from dextouch.serving import (
     takes,
 )
 from services.dashboard.settings import DashboardSettings
+from services.dashboard.upstream import SCOPE
 
 COOKIE = "dextouch_session"
-SCOPE = "operate"
 MAX_SESSIONS = 1000
 # Jinja2 escapes all values; no HTML is built from strings elsewhere.
 TEMPLATES = Environment(
     loader=FileSystemLoader(Path(__file__).parent / "templates"), autoescape=True
 )
 HELP = "/help/"
+PLAYER = "/episodes/{kind}/{item_id}"
 # Tasks that the recorder offers by default: those of the twin.
 DEFAULT_TASKS: Final = Path(__file__).with_name("tasks.toml")
-
-
-@dataclass(frozen=True)
-class Document:
-    """A document as HTML, and the titles of all others by name."""
-
-    name: str
-    html: Markup
-    titles: Mapping[str, str]
 
 
 class Documents:
@@ -78,8 +70,8 @@ class Documents:
         """First headings of the documents at the top of the folder, by name."""
         return {name: _title(path) for name, path in self._paths.items() if "/" not in name}
 
-    def read(self, name: str) -> Document:
-        """One document by its name, which is its path without `.md`.
+    def read(self, name: str) -> Markup:
+        """HTML of a document by its name, which is its path without `.md`.
 
         Raises:
             NotFoundError: no such document, or none is installed.
@@ -96,7 +88,7 @@ class Documents:
             for part in token.children or ():
                 self._link(part, posixpath.dirname(name))
         html = self._markdown.renderer.render(tokens, self._markdown.options, {})
-        return Document(name, Markup(html), self.titles)  # noqa: S704 - HTML is off in the parser
+        return Markup(html)  # noqa: S704 - HTML is off in the parser
 
     def _link(self, part: Token, folder: str) -> None:
         """Lead links between documents to their pages; those to other files of a checkout go."""
@@ -176,13 +168,7 @@ SCREENS: Final = (
     Screen("/fleet", "fleet.html", "Fleet", help="several-stations", of_several=True),
     Screen("/health", "health.html", "Health", help="health"),
     Screen("/episodes", "episodes.html", "Episodes", help="recordings-and-episodes"),
-    Screen(
-        "/episodes/{kind}/{item_id}",
-        "player.html",
-        "Player",
-        within="Episodes",
-        help="playing-an-episode",
-    ),
+    Screen(PLAYER, "player.html", "Player", within="Episodes", help="playing-an-episode"),
     Screen("/objects", "objects.html", "Mark objects", within="Episodes", help="mark-objects"),
     Screen("/review", "review.html", "Review", help="review"),
     Screen("/hours", "hours.html", "Hours", help="hours"),
@@ -340,9 +326,11 @@ def _shown(
         names, chosen = list(settings.station_urls()), request.query_params.get("station")
         if chosen is not None and chosen not in names:
             raise NotFoundError(f"station {chosen!r}: this dashboard shows {', '.join(names)}")
-        document = None
+        document: dict[str, object] = {}
         if screen.title == "Help":
-            document = await to_thread(documents.read, request.path_params["name"])
+            name = request.path_params["name"]
+            document = {"name": name, "html": await to_thread(documents.read, name)}
+            document["titles"] = await to_thread(getattr, documents, "titles")
         return _page(
             chosen or (names[0] if names else settings.station),
             screen.template,

@@ -12,7 +12,7 @@ from pydantic_core import to_json
 
 from dextouch import schemas
 from dextouch.errors import DexTouchError, NotFoundError
-from dextouch.frozen_model import FrozenModel
+from dextouch.frozen_model import FrozenModel, is_none
 from dextouch.streams import unpack
 from dextouch.tactile import LayoutDescription
 from services.dashboard.feeds import Feeds, Message, Topic, topic_message
@@ -38,9 +38,7 @@ class WorldView(FrozenModel):
     tasks: tuple[str, ...]
     model_rate_hz: float
     predicts_touch: bool
-    tactile_layout: LayoutDescription | None = Field(
-        default=None, exclude_if=lambda one: one is None
-    )
+    tactile_layout: LayoutDescription | None = Field(default=None, exclude_if=is_none)
 
 
 class ListedRollout(schemas.WatchedRollout):
@@ -168,7 +166,7 @@ class _Watched:
         """The message with the newest steps; one with the reason where there are none."""
         try:
             upstream = self._feeds.upstream(self._service)
-            answer = await upstream.forward("GET", self._path, {"if-none-match": self._tag}, b"")
+            answer = await upstream.send("GET", self._path, headers={"if-none-match": self._tag})
         except NotFoundError:
             return [topic_message(self._topic, {"gone": True, "note": "It was ended, or expired."})]
         except DexTouchError as error:

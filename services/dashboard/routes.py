@@ -3,9 +3,8 @@
 import asyncio
 from collections.abc import Awaitable, Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import partial
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, Final
 from urllib.parse import quote
 
 from fastapi import (
@@ -41,11 +40,11 @@ from services.dashboard.feeds import (
 )
 from services.dashboard.fleet import Fleet
 from services.dashboard.hand_driving import Moves
-from services.dashboard.pages import COOKIE, SCOPE, Sessions
+from services.dashboard.pages import COOKIE, Sessions
 from services.dashboard.settings import DashboardSettings
 from services.dashboard.station_view import RecorderView
 from services.dashboard.system import System, SystemView
-from services.dashboard.upstream import Upstream
+from services.dashboard.upstream import FORWARDED, Forwarded, Upstream
 
 WEBSOCKET_REFUSED = 1008
 # Interval at which a WebSocket checks that its session is still valid.
@@ -69,8 +68,6 @@ PASSED_HEADERS: Final = (
 TIMEOUT_S: Final = 60.0
 # Without a byte of a download: the time in which the store exports a long recording.
 DOWNLOAD_TIMEOUT_S: Final = 600.0
-# Of administrators, who have it beside that of operators.
-ENROL: Final = "enrol"
 
 
 class Subscription(FrozenModel):
@@ -273,83 +270,6 @@ def _view(text: str) -> tuple[str, ...]:
         return ()
 
 
-@dataclass(frozen=True)
-class Forwarded:
-    """A route of a service, `path` below its /v1, offered as /v1/SERVICE/PATH.
-
-    The key that signed in needs `scope`. A `streamed` response is passed on as it comes.
-    """
-
-    service: str
-    path: str
-    method: Literal["GET", "POST", "DELETE"] = "GET"
-    max_body_bytes: int = 64 * KIB
-    scope: str = SCOPE
-    streamed: bool = False
-
-
-FORWARDED: Final = (
-    Forwarded("acquisition", "/health"),
-    Forwarded("acquisition", "/health/events"),
-    Forwarded("acquisition", "/health/history"),
-    Forwarded("episode_store", "/episodes"),
-    Forwarded("episode_store", "/episodes/{item_id}"),
-    Forwarded("episode_store", "/recordings"),
-    Forwarded("episode_store", "/recordings/{item_id}/attributes"),
-    Forwarded("episode_store", "/catalog/items"),
-    Forwarded("episode_store", "/catalog/groups"),
-    Forwarded("episode_store", "/catalog/reviews", "POST", max_body_bytes=256 * KIB),
-    Forwarded("episode_store", "/catalog/clicks"),
-    Forwarded("episode_store", "/catalog/clicks/file"),
-    Forwarded("episode_store", "/episodes/{item_id}/clicks"),
-    Forwarded("episode_store", "/episodes/{item_id}/clicks", "POST", max_body_bytes=16 * KIB),
-    Forwarded("episode_store", "/episodes/{item_id}/trim", "POST", max_body_bytes=16 * KIB),
-    Forwarded("episode_store", "/catalog/relabel", "POST", max_body_bytes=256 * KIB),
-    Forwarded("episode_store", "/notes/{kind}/{item_id}"),
-    Forwarded("episode_store", "/notes/{kind}/{item_id}", "POST", max_body_bytes=16 * KIB),
-    Forwarded("episode_store", "/notes/{kind}/{item_id}/remove", "POST", max_body_bytes=16 * KIB),
-    Forwarded("episode_store", "/catalog/hours"),
-    Forwarded("episode_store", "/catalog/hours/{field}"),
-    Forwarded("episode_store", "/catalog/values"),
-    Forwarded("episode_store", "/catalog/lineage/{kind}/{item_id}"),
-    Forwarded("episode_store", "/playback/{kind}/{item_id}"),
-    Forwarded("episode_store", "/playback/{kind}/{item_id}/images/{camera}"),
-    Forwarded("episode_store", "/playback/{kind}/{item_id}/signals"),
-    Forwarded("episode_store", "/playback/episode/{item_id}/robot_hands"),
-    Forwarded("episode_store", "/episodes/{item_id}/streams/{stream}"),
-    Forwarded("episode_store", "/recordings/{item_id}/streams/{stream}"),
-    Forwarded("episode_store", "/downloads", "POST", max_body_bytes=1024 * KIB, streamed=True),
-    Forwarded("episode_store", "/trash"),
-    Forwarded("episode_store", "/trash", "POST", max_body_bytes=256 * KIB),
-    Forwarded("episode_store", "/trash/restore", "POST", max_body_bytes=256 * KIB),
-    Forwarded("episode_store", "/uploads"),
-    Forwarded("episode_store", "/enrolments"),
-    Forwarded("episode_store", "/enrolments", "POST", scope=ENROL),
-    Forwarded("episode_store", "/enrolments/{station}/revoke", "POST", scope=ENROL),
-    Forwarded("acquisition", "/uploads"),
-    Forwarded("acquisition", "/faults/{fault}", "POST"),
-    Forwarded("alignment", "/alignments"),
-    Forwarded("alignment", "/alignments", "POST"),
-    Forwarded("alignment", "/alignments/{alignment_id}"),
-    Forwarded("alignment", "/alignments/{alignment_id}/cancel", "POST"),
-    Forwarded("alignment", "/calibration"),
-    Forwarded("alignment", "/calibration/practice/start", "POST"),
-    Forwarded("alignment", "/calibration/practice/stop", "POST"),
-    Forwarded("alignment", "/calibration/run"),
-    Forwarded("alignment", "/calibration/run/image"),
-    Forwarded("alignment", "/calibration/runs", "POST"),
-    Forwarded("alignment", "/calibration/run/answer", "POST"),
-    Forwarded("alignment", "/calibration/run/take", "POST"),
-    Forwarded("alignment", "/calibration/run/drop", "POST"),
-    Forwarded("alignment", "/calibration/run/finish", "POST"),
-    Forwarded("alignment", "/calibration/run/cancel", "POST"),
-    Forwarded("studies", "/studies"),
-    Forwarded("studies", "/studies/{name}"),
-    Forwarded("studies", "/studies/{name}/rollouts"),
-    Forwarded("studies", "/studies/{name}/picture"),
-)
-
-
 def forwarding_router(fleet: Fleet, sessions: Sessions) -> APIRouter:
     """Create the forwarded routes; the services' own documents describe their bodies."""
     router = APIRouter(
@@ -380,17 +300,14 @@ def _forwarder(
             )
         if query:
             path += f"?{query}"
-        sent = {
-            name: request.headers[name] for name in ("if-none-match",) if name in request.headers
-        }
-        content = await request.body() if route.method == "POST" else b""
-        if content:
-            sent["content-type"] = JSON
-        answer = await feeds.upstream(route.service).forward(
+        known = request.headers.get("if-none-match")
+        content = await request.body() if route.action else b""
+        answer = await feeds.upstream(route.service).send(
             route.method,
             path,
-            sent,
             content,
+            headers=({"if-none-match": known} if known else {})
+            | ({"content-type": JSON} if content else {}),
             timeout_s=DOWNLOAD_TIMEOUT_S if route.streamed else TIMEOUT_S,
             stream=route.streamed,
         )
@@ -402,4 +319,4 @@ def _forwarder(
             )
         return Response(answer.content, answer.status_code, headers=passed)
 
-    return takes({JSON: route.max_body_bytes})(forward) if route.method == "POST" else forward
+    return takes({JSON: route.max_kib * KIB})(forward) if route.method == "POST" else forward

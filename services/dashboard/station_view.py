@@ -7,7 +7,7 @@ from urllib.parse import quote
 from pydantic import Field
 
 from dextouch.errors import AccessDeniedError, DexTouchError, NotFoundError
-from dextouch.frozen_model import FrozenModel
+from dextouch.frozen_model import FrozenModel, is_none
 from dextouch.schemas import (
     DeviceHealth,
     HealthCause,
@@ -105,7 +105,7 @@ class GloveView(FrozenModel):
 
     taxels: dict[TaxelState, tuple[int, ...]]
     tare_age_s: float | None
-    layout: LayoutDescription | None = Field(default=None, exclude_if=lambda layout: layout is None)
+    layout: LayoutDescription | None = Field(default=None, exclude_if=is_none)
 
 
 class StationView(FrozenModel):

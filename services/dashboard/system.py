@@ -120,12 +120,11 @@ class System:
     """Asks every service for its health and metrics."""
 
     def __init__(self, stations: Mapping[str, Upstream], upstreams: Mapping[str, Upstream]) -> None:
-        probes = {
-            f"station {name}": Probe(f"station {name}", one) for name, one in stations.items()
-        }
-        shown = {name: name.replace("_", " ") for name in upstreams if name != "acquisition"}
-        probes |= {name: Probe(title, upstreams[name]) for name, title in shown.items()}
-        self._probes = tuple(probes.values())
+        others = {name: one for name, one in upstreams.items() if name != "acquisition"}
+        self._probes = (
+            *(Probe(f"station {name}", one) for name, one in stations.items()),
+            *(Probe(name.replace("_", " "), one) for name, one in others.items()),
+        )
         self.topic = Topic.of_json("system", PERIOD_S, self.read)
 
     async def read(self) -> SystemView:
@@ -134,20 +133,16 @@ class System:
         services = [service for service, _ in found]
         places = [_process(service, metrics) for service, metrics in found]
         shared = {one for one in places if one is not None and places.count(one) > 1}
-        pairs = list(zip(self._probes, found, strict=True))
+        known = [(probe, metrics) for probe, (_, metrics) in zip(self._probes, found, strict=True)]
         return SystemView(
             version=__version__,
             services=tuple(
                 service.model_copy(update={"shares_process": place in shared})
                 for service, place in zip(services, places, strict=True)
             ),
-            disks=tuple(disk for probe, (_, metrics) in pairs for disk in probe.disks(metrics)),
-            spools=tuple(
-                spool for probe, (_, metrics) in pairs for spool in spools_of(probe.name, metrics)
-            ),
-            queues=tuple(
-                queue for probe, (_, metrics) in pairs for queue in queues_of(probe.name, metrics)
-            ),
+            disks=tuple(one for probe, metrics in known for one in probe.disks(metrics)),
+            spools=tuple(one for probe, metrics in known for one in spools_of(probe.name, metrics)),
+            queues=tuple(one for probe, metrics in known for one in queues_of(probe.name, metrics)),
         )
 
 

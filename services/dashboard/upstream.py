@@ -3,8 +3,9 @@
 import ssl
 import time
 from collections.abc import Mapping
+from dataclasses import dataclass
 from http import HTTPStatus
-from typing import Any, TypeVar
+from typing import Any, Final, TypeVar
 
 import httpx
 from prometheus_client import Histogram
@@ -15,6 +16,9 @@ from dextouch.schemas import Problem, error_from_problem, first_problems
 from dextouch.tracing import trace_headers
 
 Form = TypeVar("Form")
+# Scopes of operators, and of administrators, who have theirs beside it.
+SCOPE: Final = "operate"
+ENROL: Final = "enrol"
 SECONDS = (0.005, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
 
 
@@ -87,45 +91,30 @@ class Upstream:
         self,
         method: str,
         path: str,
-        body: Mapping[str, Any] | None = None,
+        body: Mapping[str, Any] | bytes | None = None,
         *,
+        headers: Mapping[str, str] | None = None,
         timeout_s: float | None = None,
+        stream: bool = False,
     ) -> httpx.Response:
-        """Response to a request, with `body` as JSON; `timeout_s` replaces that of the client.
+        """Response to a request, also "304 Not Modified"; bytes are sent as they are.
+
+        `timeout_s` replaces that of the client. With `stream` the content is not read yet, and the
+        caller closes it.
 
         Raises:
             UnavailableError: no response, or a refusal without a reason.
             DexTouchError: a refusal of the service, as its own class.
         """
-        limit = httpx.USE_CLIENT_DEFAULT if timeout_s is None else timeout_s
-        return await self._sent(self._client.build_request(method, path, json=body, timeout=limit))
-
-    async def forward(
-        self,
-        method: str,
-        path: str,
-        headers: Mapping[str, str],
-        content: bytes,
-        *,
-        timeout_s: float | None = None,
-        stream: bool = False,
-    ) -> httpx.Response:
-        """Response to a request of a browser, also "304 Not Modified"; otherwise as `send`.
-
-        With `stream` its content is not read yet, and the caller closes it.
-        """
+        given = {"content": body or None} if isinstance(body, bytes) else {"json": body}
         request = self._client.build_request(
             method,
             path,
-            headers=dict(headers),
-            content=content or None,
+            headers={**(headers or {}), **trace_headers()},
+            **given,
             timeout=httpx.USE_CLIENT_DEFAULT if timeout_s is None else timeout_s,
         )
-        return await self._sent(request, stream=stream)
-
-    async def _sent(self, request: httpx.Request, *, stream: bool = False) -> httpx.Response:
-        method, path = request.method, request.url.path
-        request.headers.update(trace_headers())
+        path = request.url.path
         began_s = time.perf_counter()
         outcome = "failed"
         try:
@@ -181,3 +170,71 @@ class Upstream:
     async def close(self) -> None:
         """Close the connections."""
         await self._client.aclose()
+
+
+@dataclass(frozen=True)
+class Forwarded:
+    """A route of a service, `path` below its /v1, offered as /v1/SERVICE/PATH.
+
+    One that changes something has an `action`, by which the audit log calls it, and a body of at
+    most `max_kib`. The key that signed in needs `scope`. A `streamed` response is passed on as it
+    comes.
+    """
+
+    service: str
+    path: str
+    action: str = ""
+    max_kib: int = 64
+    scope: str = SCOPE
+    streamed: bool = False
+
+    @property
+    def method(self) -> str:
+        """Of the request."""
+        return "POST" if self.action else "GET"
+
+
+# Paths below a service and the beginning that they share.
+_READ: Final[Mapping[tuple[str, str], tuple[str, ...]]] = {
+    ("acquisition", ""): ("/health", "/health/events", "/health/history", "/uploads"),
+    ("alignment", ""): ("/alignments", "/alignments/{alignment_id}"),
+    ("alignment", "/calibration"): ("", "/run", "/run/image"),
+    ("episode_store", ""): ("/episodes", "/recordings", "/trash", "/uploads", "/enrolments"),
+    ("episode_store", "/catalog"): ("/items", "/groups", "/values", "/hours", "/hours/{field}"),
+    ("episode_store", "/catalog/clicks"): ("", "/file"),
+    ("episode_store", "/catalog/lineage"): ("/{kind}/{item_id}",),
+    ("episode_store", "/episodes/{item_id}"): ("", "/clicks", "/streams/{stream}"),
+    ("episode_store", "/recordings/{item_id}"): ("/attributes", "/streams/{stream}"),
+    ("episode_store", "/notes"): ("/{kind}/{item_id}",),
+    ("episode_store", "/playback/{kind}/{item_id}"): ("", "/images/{camera}", "/signals"),
+    ("episode_store", "/playback/episode/{item_id}"): ("/robot_hands",),
+    ("studies", "/studies"): ("", "/{name}", "/{name}/rollouts", "/{name}/picture"),
+}
+_CALIBRATION: Final = {
+    "runs": "start calibration",
+    "run/answer": "answer calibration",
+    "run/take": "keep calibration place",
+    "run/drop": "drop calibration place",
+    "run/finish": "finish calibration",
+    "run/cancel": "cancel calibration",
+    "practice/start": "start practice devices",
+    "practice/stop": "stop practice devices",
+}
+FORWARDED: Final = (
+    *(Forwarded(of[0], of[1] + path) for of, paths in _READ.items() for path in paths),
+    Forwarded("acquisition", "/faults/{fault}", "simulate fault"),
+    Forwarded("episode_store", "/catalog/reviews", "review", 256),
+    Forwarded("episode_store", "/catalog/relabel", "relabel", 256),
+    Forwarded("episode_store", "/episodes/{item_id}/clicks", "mark objects", 16),
+    Forwarded("episode_store", "/episodes/{item_id}/trim", "trim", 16),
+    Forwarded("episode_store", "/notes/{kind}/{item_id}", "add note", 16),
+    Forwarded("episode_store", "/notes/{kind}/{item_id}/remove", "remove note", 16),
+    Forwarded("episode_store", "/downloads", "download", 1024, streamed=True),
+    Forwarded("episode_store", "/trash", "delete", 256),
+    Forwarded("episode_store", "/trash/restore", "restore", 256),
+    Forwarded("episode_store", "/enrolments", "enrol station", scope=ENROL),
+    Forwarded("episode_store", "/enrolments/{station}/revoke", "revoke station", scope=ENROL),
+    Forwarded("alignment", "/alignments", "align"),
+    Forwarded("alignment", "/alignments/{alignment_id}/cancel", "cancel alignment"),
+    *(Forwarded("alignment", f"/calibration/{path}", name) for path, name in _CALIBRATION.items()),
+)

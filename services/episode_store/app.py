@@ -12,12 +12,11 @@ from fastapi import FastAPI
 from dextouch.episodes import EpisodeStore
 from dextouch.episodes.care import DeletionRecords
 from dextouch.errors import DexTouchError
-from dextouch.schemas import load_object_clicks
+from dextouch.schemas import ObjectClicks
 from dextouch.serving import ServedFolder, create_service_app, serve
 from services.episode_store.catalog import Catalog
 from services.episode_store.deletions import deletions_router
 from services.episode_store.downloads import Downloads, downloads_router
-from services.episode_store.editing_routes import editing_router, notes_router
 from services.episode_store.ingest import Ingest
 from services.episode_store.intake import Admission, StorageLimits, UploadMetrics
 from services.episode_store.keys import Enrolments, enrolment_router
@@ -25,7 +24,9 @@ from services.episode_store.reading import content_router, playback_router
 from services.episode_store.routes import (
     catalog_router,
     clicks_router,
+    editing_router,
     idle_uploads_router,
+    notes_router,
     reviews_router,
     trash_router,
     uploads_router,
@@ -99,8 +100,7 @@ class PendingUploads(PeriodicThread):
     def work(self) -> None:
         """Try once.
 
-        Raises:
-            StorageError, UnavailableError: something failed and waits for the next time.
+        Raises StorageError, UnavailableError: something failed and waits for the next time.
         """
         for kind, item_id in self._store.complete_uploads():
             logger.warning("upload_completed", kind=kind, id=item_id)
@@ -118,49 +118,48 @@ def purge_old_trash(store: EpisodeStore, keep_days: float | None) -> None:
             logger.info("trash_purged", kind=entry.kind, id=entry.item_id)
 
 
-class DeletionWatch(PeriodicThread):
-    """Drops uploads of deleted takes that nobody continues, soon after the deletion.
+def deletion_watch(
+    records: DeletionRecords, drop: Callable[[], list[str]], ended: Callable[[str], None]
+) -> Callable[[], None]:
+    """What drops uploads of deleted takes if there was a deletion since the last call.
 
-    Args:
-        records: of the store.
-        drop: drops uploads of deleted takes, and returns their ids.
-        ended: called with the id of each dropped upload.
+    `drop` does so and returns their ids; `ended` is called with each.
     """
+    known = ""
 
-    def __init__(
-        self, records: DeletionRecords, drop: Callable[[], list[str]], ended: Callable[[str], None]
-    ) -> None:
-        super().__init__("fail_deletions", WATCH_PERIOD_S, self.work)
-        self._records, self._drop, self._ended = records, drop, ended
-        self._revision = ""
+    def work() -> None:
+        nonlocal known
+        revision = records.revision
+        if revision != known:
+            for recording_id in drop():
+                ended(recording_id)
+            known = revision
 
-    def work(self) -> None:
-        """Drop uploads if there was a deletion since the last time."""
-        revision = self._records.revision
-        if revision != self._revision:
-            for recording_id in self._drop():
-                self._ended(recording_id)
-            self._revision = revision
+    return work
 
 
 def create_app(settings: EpisodeStoreSettings) -> FastAPI:
     """Create the application of one store; it clears up after killed writers."""
     store = EpisodeStore(settings.store_url)
     catalog = Catalog(store)
-    objects = None if settings.objects is None else load_object_clicks(settings.objects)
+    objects = None if settings.objects is None else ObjectClicks.load(settings.objects)
     ingest = Ingest(store, settings)
     limits = StorageLimits(ingest.folder, settings, recordings=catalog.bytes_by_station)
     admission = Admission(
         max_requests=settings.max_batches_in_flight, max_bytes=settings.max_bytes_in_flight
     )
-    metrics = UploadMetrics(limits, catalog.num_items())
+    metrics = UploadMetrics(limits, catalog.index.num_items)
     deletions = DeletionRecords(store.root)
     index = catalog.index
     threads = (
         PendingUploads(store),
         # Reading a large store takes minutes, and can be interrupted anywhere.
         PeriodicThread("catalog_not_checked", index.check_period_s, index.check, patience_s=2.0),
-        DeletionWatch(deletions, ingest.drop_deleted, limits.end),
+        PeriodicThread(
+            "fail_deletions",
+            WATCH_PERIOD_S,
+            deletion_watch(deletions, ingest.drop_deleted, limits.end),
+        ),
         PeriodicThread(
             "trash_not_purged",
             TRASH_PERIOD_S,

@@ -11,28 +11,9 @@ from typing import Any, Final, NamedTuple, TypeVar
 
 import numpy as np
 
+from dextouch import schemas
 from dextouch.episodes import KINDS, EpisodeStore, Kind
 from dextouch.errors import NotFoundError
-from dextouch.schemas import (
-    CatalogHours,
-    CatalogItem,
-    CatalogItems,
-    CatalogValues,
-    ComparedGroup,
-    ComparedGroups,
-    EpisodeClicks,
-    EpisodeList,
-    EpisodeSummary,
-    HoursByField,
-    HoursOf,
-    HoursRow,
-    Lineage,
-    LineageNode,
-    RecordingList,
-    RecordingSummary,
-    Review,
-    StoredItem,
-)
 from services.episode_store.catalog_index import CatalogIndex, Progress
 from services.episode_store.filters import (
     EARLIEST,
@@ -61,7 +42,7 @@ from services.episode_store.items import (
 )
 
 T = TypeVar("T")
-S = TypeVar("S", EpisodeSummary, RecordingSummary)
+S = TypeVar("S", schemas.EpisodeSummary, schemas.RecordingSummary)
 FIRST_PAGE: Final = Page()
 # Limit of the values of a field in one response.
 MAX_VALUES: Final = 500
@@ -108,7 +89,7 @@ class Clickable:
     """An episode that training would take if its objects were clicked."""
 
     task: str
-    clicks: EpisodeClicks | None
+    clicks: schemas.EpisodeClicks | None
 
 
 class Catalog:
@@ -121,25 +102,20 @@ class Catalog:
         self._store = store
         self.index = CatalogIndex(store, progress)
 
-    def num_items(self) -> dict[str, Callable[[], int]]:
-        """Functions that say how many items of a kind were there when they were last listed."""
-        return {
-            "recording": partial(self.index.num_items, "recording"),
-            "episode": partial(self.index.num_items, "episode"),
-        }
-
-    def episodes(self, query: EpisodeFilter, *, limit: int, page: Page = FIRST_PAGE) -> EpisodeList:
+    def episodes(
+        self, query: EpisodeFilter, *, limit: int, page: Page = FIRST_PAGE
+    ) -> schemas.EpisodeList:
         """One page of matching episodes in the order of the page."""
-        rows, facts = self._summaries("episode", EpisodeSummary, query, limit, page)
-        return EpisodeList.model_construct(episodes=rows, **facts)
+        rows, facts = self._summaries("episode", schemas.EpisodeSummary, query, limit, page)
+        return schemas.EpisodeList.model_construct(episodes=rows, **facts)
 
     def recordings(
         self, query: CatalogFilter | None = None, *, limit: int, page: Page = FIRST_PAGE
-    ) -> RecordingList:
+    ) -> schemas.RecordingList:
         """One page of matching finished recordings in the order of the page."""
         wanted = query or CatalogFilter()
-        rows, facts = self._summaries("recording", RecordingSummary, wanted, limit, page)
-        return RecordingList.model_construct(recordings=rows, **facts)
+        rows, facts = self._summaries("recording", schemas.RecordingSummary, wanted, limit, page)
+        return schemas.RecordingList.model_construct(recordings=rows, **facts)
 
     def _summaries(
         self, kind: Kind, model: type[S], query: CatalogFilter, limit: int, page: Page
@@ -165,10 +141,10 @@ class Catalog:
         text = f"SELECT {', '.join(ListedRow._fields)} FROM item i WHERE {where.sql} ORDER BY i.id"
         return self.index.read(lambda c: list(map(ListedRow._make, c.execute(text, where.values))))
 
-    def values(self) -> CatalogValues:
+    def values(self) -> schemas.CatalogValues:
         """Tasks, operators and stations that occur, at most MAX_VALUES of each."""
 
-        def read(connection: sqlite3.Connection) -> CatalogValues:
+        def read(connection: sqlite3.Connection) -> schemas.CatalogValues:
             found: dict[str, tuple[str, ...]] = {}
             for name in ("task", "operator", "station"):
                 key = _KEYS[name]
@@ -180,19 +156,20 @@ class Catalog:
                   SELECT x FROM v WHERE x > ''"""
                 rows = (row for kind in KINDS for row in connection.execute(text, {"kind": kind}))
                 found[f"{name}s"] = tuple(sorted({value for (value,) in rows})[:MAX_VALUES])
-            return CatalogValues(**found)
+            return schemas.CatalogValues(**found)
 
         return self.index.read(read)
 
-    def lineage(self, kind: Kind, item_id: str) -> Lineage:
+    def lineage(self, kind: Kind, item_id: str) -> schemas.Lineage:
         """Everything that an item was made from and that was made from it, nearest first.
 
-        Raises:
-            NotFoundError: no such item.
+        Raises NotFoundError: no such item.
         """
         return self.index.read(partial(_lineage, start=(kind, item_id)))
 
-    def items(self, query: ItemFilter, *, limit: int, page: Page = FIRST_PAGE) -> CatalogItems:
+    def items(
+        self, query: ItemFilter, *, limit: int, page: Page = FIRST_PAGE
+    ) -> schemas.CatalogItems:
         """One page of matching recordings, episodes or takes in the order of the page."""
         of_takes = query.kind == "take"
         where = Condition(of_takes=of_takes, terms=["i.is_take"])
@@ -202,38 +179,30 @@ class Catalog:
         weight = "i.take_weight" if of_takes else "i.weight"
         order = _Order(_KEYS.get(page.sort, weight), "i.name", page)
 
-        def read(connection: sqlite3.Connection) -> CatalogItems:
+        def read(connection: sqlite3.Connection) -> schemas.CatalogItems:
             found, facts = _page(connection, where, order, limit)
-            return CatalogItems.model_construct(items=_items(connection, found), **facts)
+            return schemas.CatalogItems.model_construct(items=_items(connection, found), **facts)
 
         return self.index.read(read)
 
-    def groups(self) -> ComparedGroups:
+    def groups(self) -> schemas.ComparedGroups:
         """The groups of items that are compared with each other to find outliers."""
         names = ("task", "domain", "origin", "kind", "num_items")
         text = f"SELECT {', '.join(names)} FROM grp WHERE num_items > 0 ORDER BY 1, 2, 3, 4"
         rows = self.index.read(lambda connection: connection.execute(text).fetchall())
         groups = (
-            ComparedGroup(
+            schemas.ComparedGroup(
                 **dict(zip(names, row, strict=True)),
                 min_items=MIN_ITEMS,
                 is_compared=row[-1] >= MIN_ITEMS,
             )
             for row in rows
         )
-        return ComparedGroups(groups=tuple(groups))
+        return schemas.ComparedGroups(groups=tuple(groups))
 
-    def review(self, item: StoredItem, review: Review | None) -> None:
-        """Keep the review of an item; None removes it.
-
-        Raises:
-            NotFoundError: no such item.
-        """
+    def review(self, item: schemas.StoredItem, review: schemas.Review | None) -> None:
+        """Keep the review of an item; None removes it. Raises NotFoundError: no such item."""
         self._store.set_review(item.id, review, kind=item.kind)
-        self.forget(item)
-
-    def forget(self, item: StoredItem) -> None:
-        """Read an item again, after a change of what is beside its content."""
         self.index.reread(item.kind, item.id)
 
     def clickable(self) -> dict[str, Clickable]:
@@ -242,21 +211,21 @@ class Catalog:
           WHERE i.is_clickable AND i.verdict IS NOT 'rejected' ORDER BY i.id"""
         rows = self.index.read(lambda connection: connection.execute(text).fetchall())
         return {
-            name: Clickable(task, clicks and EpisodeClicks.model_validate_json(clicks))
+            name: Clickable(task, clicks and schemas.EpisodeClicks.model_validate_json(clicks))
             for name, task, clicks in rows
         }
 
-    def set_clicks(self, episode_id: str, clicks: EpisodeClicks | None) -> None:
+    def set_clicks(self, episode_id: str, clicks: schemas.EpisodeClicks | None) -> None:
         """Keep the clicks on the objects of an episode; raises as `review`."""
         self._store.set_clicks(episode_id, clicks)
         self.index.reread("episode", episode_id)
 
-    def hours(self, query: EpisodeFilter) -> CatalogHours:
+    def hours(self, query: EpisodeFilter) -> schemas.CatalogHours:
         """Total duration of matching episodes by task, domain and origin."""
         columns = "sum(i.num), coalesce(sum(i.success * i.num), 0), sum(i.duration_ns)"
         by = ("task", "domain", "origin")
         rows = [
-            HoursRow(
+            schemas.HoursRow(
                 **dict(zip(by, names, strict=True)),
                 num_episodes=count,
                 num_successes=num_successes,
@@ -266,13 +235,13 @@ class Catalog:
                 [f"i.{name}" for name in by], columns, query
             )
         ]
-        return CatalogHours(
+        return schemas.CatalogHours(
             rows=tuple(rows),
             num_episodes=sum(row.num_episodes for row in rows),
             hours=sum(row.hours for row in rows),
         )
 
-    def hours_by(self, field: HoursField, query: HoursFilter) -> HoursByField:
+    def hours_by(self, field: HoursField, query: HoursFilter) -> schemas.HoursByField:
         """Total duration of matching episodes by the values of a field, and by their reviews."""
         column = f"i.{field}"
         if field == "day":
@@ -289,13 +258,13 @@ class Catalog:
             parts = found[value]
             names = {"accepted_h": "accepted", "rejected_h": "rejected", "not_reviewed_h": None}
             is_day = field == "day" and value is not None
-            row = HoursOf(
+            row = schemas.HoursOf(
                 value=date.fromordinal(1 + value).isoformat() if is_day else value,
                 num_episodes=sum(count for count, _ in parts.values()),
                 **{name: parts.get(verdict, (0, 0.0))[1] for name, verdict in names.items()},
             )
             rows.append(row)
-        return HoursByField(rows=tuple(rows))
+        return schemas.HoursByField(rows=tuple(rows))
 
     def _sums(self, by: Sequence[str], columns: str, query: EpisodeFilter) -> list[tuple[Any, ...]]:
         """Sums over matching episodes by values, in their order."""
@@ -324,7 +293,6 @@ class _Order:
 
     @property
     def columns(self) -> str:
-        """Columns to order by."""
         down = " DESC" if self.page.descending else ""
         return f"n{down}" if self.page.sort == "id" else f"k{down}, n{down}"
 
@@ -372,7 +340,9 @@ def _array(rows: Iterable[int]) -> str:
     return json.dumps(list(rows))
 
 
-def _items(connection: sqlite3.Connection, found: Sequence[Found]) -> tuple[CatalogItem, ...]:
+def _items(
+    connection: sqlite3.Connection, found: Sequence[Found]
+) -> tuple[schemas.CatalogItem, ...]:
     """Items of rows with what others say of them; takes where a second row is given."""
     wanted = _array(row for pair in found for row in pair if row is not None)
     sources: defaultdict[int, list[Source]] = defaultdict(list)
@@ -389,7 +359,7 @@ def _items(connection: sqlite3.Connection, found: Sequence[Found]) -> tuple[Cata
     for row, kind, stands, is_compared, text, written, spread in connection.execute(
         _BODIES, (wanted,)
     ):
-        item = CatalogItem.model_validate_json(text)
+        item = schemas.CatalogItem.model_validate_json(text)
         review = _review(written)
         counts = review if stands or review is None else review.earlier
         changes = {"review": counts, "episodes": tuple(products[row])}
@@ -405,11 +375,11 @@ def _items(connection: sqlite3.Connection, found: Sequence[Found]) -> tuple[Cata
     )
 
 
-def _review(text: str | None) -> Review | None:
-    return None if text is None else Review.model_validate_json(text)
+def _review(text: str | None) -> schemas.Review | None:
+    return None if text is None else schemas.Review.model_validate_json(text)
 
 
-def _lineage(connection: sqlite3.Connection, start: Name) -> Lineage:
+def _lineage(connection: sqlite3.Connection, start: Name) -> schemas.Lineage:
     def sources(name: Name) -> list[Name]:
         text = """SELECT l.kind, l.source FROM item i JOIN lineage l USING (row)
           WHERE i.kind = ? AND i.id = ? ORDER BY l.position"""
@@ -432,9 +402,11 @@ def _lineage(connection: sqlite3.Connection, start: Name) -> Lineage:
         facts: dict[str, Any] = {"kind": name[0], "id": name[1], "relation": relation}
         facts |= {"is_stored": found is not None, "made_from": [one for _, one in sources(name)]}
         if found is not None:
-            facts["summary"] = _summary(CatalogItem.model_validate_json(found[0]))
-        rows.append(LineageNode.model_validate(facts))
-    return Lineage(nodes=tuple(rows))
+            item = schemas.CatalogItem.model_validate_json(found[0])
+            about = f"{item.task}, {item.domain}, {item.origin}, {item.duration_s:.1f} s"
+            facts["summary"] = about
+        rows.append(schemas.LineageNode.model_validate(facts))
+    return schemas.Lineage(nodes=tuple(rows))
 
 
 def _walk(
@@ -447,7 +419,3 @@ def _walk(
             if name not in nodes and len(nodes) < MAX_NODES:
                 nodes[name] = relation
                 waiting.append(name)
-
-
-def _summary(item: CatalogItem) -> str:
-    return f"{item.task}, {item.domain}, {item.origin}, {item.duration_s:.1f} s"

@@ -3,7 +3,6 @@
 It is a cache: what is lost, damaged or of another release is read again from the items.
 """
 
-import fcntl
 import os
 import sqlite3
 import uuid
@@ -14,6 +13,7 @@ from typing import Final
 
 import structlog
 
+from dextouch.episodes import held_folder
 from dextouch.episodes.care import CATALOG_FOLDER, remove_catalog
 from services.episode_store.filters import NO_WEIGHT, SORT_COLUMNS
 
@@ -156,14 +156,10 @@ class CatalogFile:
     def __init__(self, root: Path, tag: str = "") -> None:
         self._root, self._folder, self._is_bucket = root, root / CATALOG_FOLDER, bool(tag)
         self._prefix = f"v{VERSION}-{tag}-" if tag else f"v{VERSION}-"
-        self._path: Path | None = None
+        # None for a catalog in memory.
+        self.path: Path | None = None
         self._connection: sqlite3.Connection | None = None
         self._is_given_up = False
-
-    @property
-    def path(self) -> Path | None:
-        """The file; None for a catalog in memory."""
-        return self._path
 
     def connection(self) -> tuple[sqlite3.Connection, bool]:
         """The connection, and whether it is a new one: the file may have been removed."""
@@ -174,10 +170,10 @@ class CatalogFile:
         return self._connection, True
 
     def _is_valid(self) -> bool:
-        if self._path is None:
+        if self.path is None:
             # The store's folder may have been made since.
             return self._is_given_up or not (self._is_bucket or self._root.is_dir())
-        return self._path.exists()
+        return self.path.exists()
 
     def _open(self) -> sqlite3.Connection:
         if not self._is_given_up and (self._is_bucket or self._root.is_dir()):
@@ -186,7 +182,7 @@ class CatalogFile:
                     return self._open_file()
             except (OSError, sqlite3.Error) as error:
                 self.give_up(error)
-        self._path = None
+        self.path = None
         return _created(":memory:")
 
     @contextmanager
@@ -194,12 +190,8 @@ class CatalogFile:
         """No other process opens or creates a file meanwhile."""
         self._folder.mkdir(exist_ok=True, parents=self._is_bucket)
         self._give_to_owner(self._folder)
-        descriptor = os.open(self._folder, os.O_RDONLY)
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX)
+        with held_folder(self._folder):
             yield
-        finally:
-            os.close(descriptor)
 
     def _open_file(self) -> sqlite3.Connection:
         for path in sorted(self._folder.glob(f"{self._prefix}*.sqlite")):
@@ -207,7 +199,7 @@ class CatalogFile:
                 connection = _connected(path)
                 (version,) = connection.execute("PRAGMA user_version").fetchone()
                 if version == VERSION:
-                    self._path = path
+                    self.path = path
                     return connection
                 connection.close()
             except sqlite3.DatabaseError as error:
@@ -216,9 +208,9 @@ class CatalogFile:
                 logger.warning("catalog_damaged", path=str(path), reason=str(error))
             # A process was killed while it made this one, or it is damaged.
             remove_catalog(path)
-        self._path = self._folder / f"{self._prefix}{uuid.uuid4().hex[:12]}.sqlite"
-        connection = _created(str(self._path))
-        self._give_to_owner(self._path)
+        self.path = self._folder / f"{self._prefix}{uuid.uuid4().hex[:12]}.sqlite"
+        connection = _created(str(self.path))
+        self._give_to_owner(self.path)
         for other in self._folder.glob("v*.sqlite"):
             if not other.name.startswith(f"v{VERSION}-"):
                 remove_catalog(other)
@@ -232,7 +224,7 @@ class CatalogFile:
 
     def give_up(self, error: Exception) -> None:
         """After an error: begin a damaged file anew; keep the catalog in memory otherwise."""
-        path = self._path
+        path = self.path
         self.close()
         if _is_damage(error) and path is not None:
             logger.warning("catalog_damaged", path=str(path), reason=str(error))

@@ -20,6 +20,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
+from itertools import islice
 from typing import Final, NamedTuple, TypeVar
 
 import structlog
@@ -55,6 +56,9 @@ CHECK_PERIOD_S: Final = 60.0
 ALWAYS_CHECKED: Final = 500
 # Items of one transaction: others can write in between, and a kill loses little.
 BATCH: Final = 200
+# Whether rows were changed that do not fit each other yet.
+_IS_DIRTY: Final = """SELECT EXISTS (SELECT 1 FROM item WHERE is_dirty)
+  OR EXISTS (SELECT 1 FROM grp WHERE is_stale)"""
 Progress = Callable[[list[str], str, int], Iterable[str]]
 Write = Callable[[sqlite3.Connection], None]
 
@@ -72,11 +76,7 @@ class CatalogIndex:
     """The rows of a store's items; thread-safe.
 
     An item that cannot be read is omitted until the next check, and logged once by each process;
-    `verify` reports damage.
-
-    Args:
-        store: whose items they are.
-        progress: shows how many of many items were read.
+    `verify` reports damage. `progress` shows how many of many items were read.
     """
 
     def __init__(self, store: EpisodeStore, progress: Progress | None = None) -> None:
@@ -93,7 +93,7 @@ class CatalogIndex:
         self._is_checked: dict[Kind, bool] = dict.fromkeys(KINDS, False)
         self._marks: dict[Kind, int | None] = dict.fromkeys(KINDS, None)
         self._listed: dict[Kind, tuple[int, Mapping[str, int]]] = {kind: (0, {}) for kind in KINDS}
-        self._told: set[tuple[Kind, str, str]] = set()
+        self._reported: set[tuple[Kind, str, str]] = set()
         self._data_version = 0
 
     def num_items(self, kind: Kind) -> int:
@@ -107,7 +107,8 @@ class CatalogIndex:
             for kind in KINDS:
                 self._look(connection, kind)
             with snapshot(connection):
-                if not _is_dirty(connection):
+                (is_dirty,) = connection.execute(_IS_DIRTY).fetchone()
+                if not is_dirty:
                     return query(connection)
             # What was changed, or a check, a killed process or an erasure has left to do.
             with transaction(connection):
@@ -263,22 +264,14 @@ class CatalogIndex:
             for name, one in stamps.items()
             if known.get(name) == before.get(name) != one and omitted.get(name) != one
         ]
-        if len(changed) > BATCH:
-            changed_now = self._progress(changed, f"read {kind}s", len(changed))
-        else:
-            changed_now = changed
-        writes: dict[str, Write] = {}
+        many = len(changed) > BATCH
+        names = iter(self._progress(changed, f"read {kind}s", len(changed)) if many else changed)
         is_done = True
-        for number, name in enumerate(changed_now, start=1):
-            write = self._read(kind, name, stamps[name])
-            if write is not None and write is not _no_row:
-                writes[name] = write
-            elif write is _no_row and name in known:
-                gone.append(name)
-            if len(writes) == BATCH or (writes and number == len(changed)):
-                read = {each: stamps[each] for each in writes}
-                is_done &= self._write(connection, kind, read, writes)
-                writes = {}
+        while some := list(islice(names, BATCH)):
+            found_now = {name: self._read(kind, name, stamps[name]) for name in some}
+            gone += [n for n, write in found_now.items() if write is _no_row and n in known]
+            writes = {n: write for n, write in found_now.items() if write and write is not _no_row}
+            is_done &= self._write(connection, kind, {n: stamps[n] for n in writes}, writes)
         if gone:
             with transaction(connection):
                 connection.executemany(
@@ -296,6 +289,8 @@ class CatalogIndex:
         writes: Mapping[str, Write],
     ) -> bool:
         """Write rows of items that are still as they were read; returns whether all were."""
+        if not writes:
+            return True
         numbers = {name: one.folder for name, one in stamps.items()}
         with transaction(connection):
             # What was deleted since must not get a row, after its erasure from this file.
@@ -318,9 +313,9 @@ class CatalogIndex:
             return _no_row
         except StorageError as error:
             self._omitted[kind][name] = stamps
-            told = (kind, name, error.message)
-            if told not in self._told:
-                self._told.add(told)
+            problem = (kind, name, error.message)
+            if problem not in self._reported:
+                self._reported.add(problem)
                 logger.warning("omitted_from_catalog", kind=kind, id=name, reason=error.message)
             # A disk or a limit of the system changes nothing of what was read before.
             return _no_row if isinstance(error, CorruptDataError) else None
@@ -331,12 +326,3 @@ class CatalogIndex:
 
 def _no_row(_: sqlite3.Connection) -> None:
     """Stands for an item that has no row."""
-
-
-def _is_dirty(connection: sqlite3.Connection) -> bool:
-    """Whether rows were changed that do not fit each other yet."""
-    (found,) = connection.execute(
-        "SELECT EXISTS (SELECT 1 FROM item WHERE is_dirty)"
-        " OR EXISTS (SELECT 1 FROM grp WHERE is_stale)"
-    ).fetchone()
-    return bool(found)

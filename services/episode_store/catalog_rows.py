@@ -103,7 +103,7 @@ def read_row(store: EpisodeStore, kind: Kind, item_id: str, stamps: Stamps) -> I
     else:
         summary, at = _recording(store, reader), reader.attributes.started_at
     at = at and within_calendar(at)
-    item = item_of(reader, summary, None)
+    item = item_of(reader, summary)
     is_clickable = isinstance(reader, EpisodeReader) and _is_clickable(reader)
     review, clicks = read_remarks(store, kind, item_id)
     parts = (item_id, about.task, about.instruction, about.operator, about.station, about.trace_id)

@@ -23,14 +23,17 @@ class Context:
     def kind_of(self, item_id: str) -> Kind:
         """Kind of an id: given by --kind, otherwise the one under which it exists.
 
-        Raises:
-            NotFoundError: no such id.
-            InvalidInputError: both kinds exist.
+        Raises NotFoundError: no such id; InvalidInputError: both kinds exist.
         """
         check_id(item_id)
         if self.options.kind:
             return self.options.kind
-        found = [kind for kind in KINDS if self._is_there(kind, item_id)]
+        root, exists = self.root, self.store.exists
+        found = [
+            kind
+            for kind in KINDS
+            if exists(item_id, kind=kind) or (root and (root / f"{kind}s" / item_id).is_dir())
+        ]
         if not found:
             raise NotFoundError(
                 f"{item_id!r}: not in the store {self.url}, neither episode nor recording"
@@ -40,11 +43,6 @@ class Context:
                 f"{item_id!r} is an episode and a recording; name one with --kind"
             )
         return found[0]
-
-    def _is_there(self, kind: Kind, item_id: str) -> bool:
-        if self.store.exists(item_id, kind=kind):
-            return True
-        return self.root is not None and (self.root / f"{kind}s" / item_id).is_dir()
 
     def items(self) -> list[tuple[Kind, str]]:
         """Selected items: the given ids, otherwise all of the given kinds.
@@ -68,11 +66,7 @@ class Context:
         return None if self.url.startswith("s3://") else local_folder(self.url)
 
     def need_local_root(self) -> Path:
-        """The store's folder.
-
-        Raises:
-            InvalidInputError: a store in a bucket.
-        """
+        """The store's folder. Raises InvalidInputError: a store in a bucket."""
         if self.root is None:
             raise InvalidInputError(
                 f"{self.options.command}: got the store {self.url}, expected one in a folder; copy "

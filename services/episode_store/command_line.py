@@ -20,39 +20,23 @@ from dextouch.episodes import (
     Kind,
     LocalGroup,
     TrashKind,
+    care,
     clicked_poses,
     has_object_poses,
     shard_path,
     stream_arrays,
     touched_objects,
 )
-from dextouch.episodes.care import (
-    LEFT,
-    DeletionRecords,
-    DeletionRequest,
-    Finding,
-    ItemReport,
-    delete_for_good,
-    inspect_group,
-    inspect_stage,
-    inspect_upload,
-    open_contents,
-    plan_deletion,
-    repair_group,
-    repair_uploads,
-    reviews_by,
-    unfinished_folders,
-)
 from dextouch.errors import InvalidInputError, NotFoundError
 from dextouch.geometry import transform_from_pose
 from dextouch.schemas import (
     EpisodeAttributes,
     EpisodeClicks,
+    ObjectClicks,
     RecordingAttributes,
     SceneObject,
     SceneObjects,
     json_ready,
-    load_object_clicks,
 )
 from dextouch.serving import configure_logging, load_settings
 from services.episode_store.catalog import Catalog, ListedRow
@@ -175,7 +159,7 @@ def show(context: Context) -> Outcome:
     store = context.store
     reader = store.open_item(kind, item_id)
     files = store.files(item_id, kind=kind)
-    contents = open_contents(files, kind)
+    contents = care.open_contents(files, kind)
     streams, total_per_hour = {}, 0
     rows: list[tuple[str, ...]] = [
         ("stream", "Hz", "samples", "gaps", "size", "per hour", "codec", "encoder")
@@ -224,7 +208,7 @@ def show(context: Context) -> Outcome:
 def verify(context: Context) -> Outcome:
     """Verify items completely and list all damage."""
     items, root = context.items(), context.root
-    reports: list[ItemReport] = []
+    reports: list[care.ItemReport] = []
     for kind, item_id in progress(items, "verify", len(items)):
         try:
             # Not through the store, which ignores groups without a commit record.
@@ -233,14 +217,13 @@ def verify(context: Context) -> Outcome:
                 if root is None
                 else LocalGroup(root / f"{kind}s" / item_id)
             )
-            reports.append(inspect_group(files, kind))
+            reports.append(care.inspect_group(files, kind))
         except NotFoundError:
             say(f"{item_id}  deleted meanwhile  {kind}")
     if not context.options.ids:
-        for what, folder in () if root is None else unfinished_folders(root):
-            reports.append(_inspect_unfinished(what, folder))
+        reports += [] if root is None else care.inspect_unfinished(root)
         reports += [
-            ItemReport("catalog", "catalog", findings=(Finding(problem, foreign=True),))
+            care.ItemReport("catalog", "catalog", findings=(care.Finding(problem, foreign=True),))
             for problem in Catalog(context.store).index.verify()
         ]
     for report in reports:
@@ -254,14 +237,7 @@ def verify(context: Context) -> Outcome:
     return result, EXIT_DAMAGED if damaged else 0
 
 
-def _inspect_unfinished(kind: str, folder: Path) -> ItemReport:
-    if not folder.is_dir() or folder.is_symlink():
-        finding = Finding(f"{kind} {folder.name}: is not a folder; move it away", foreign=True)
-        return ItemReport(kind, folder.name, findings=(finding,))
-    return inspect_upload(folder) if kind == "upload" else inspect_stage(folder, kind)
-
-
-def _say_report(report: ItemReport) -> None:
+def _say_report(report: care.ItemReport) -> None:
     size = f"{report.num_arrays} arrays, {report.num_bytes} bytes"
     if report.damaged:
         for finding in report.findings:
@@ -278,7 +254,7 @@ def clicks(context: Context) -> Outcome:
 
     The result is a file of all clicks.
     """
-    given = load_object_clicks(context.options.clicks)
+    given = ObjectClicks.load(context.options.clicks)
     names = sorted({*given.episodes, *context.store.list()})
     found = {name: given.episodes.get(name) or context.store.clicks(name) for name in names}
     rows: list[tuple[str, ...]] = [("episode", "object", "from", "x mm", "y mm", "heading", "± mm")]
@@ -370,22 +346,24 @@ def _delete_all_of(context: Context) -> Outcome:
         )
     # Derived data of an operator is always deleted; that of a recording on request.
     derived = options.derived or options.operator is not None
-    request = DeletionRequest(
+    request = care.DeletionRequest(
         operator=options.operator, recording=options.recording, derived=derived
     )
     name = options.operator or options.recording
-    victims = plan_deletion(root, request)
+    victims = care.plan_deletion(root, request)
     for victim in victims:
         say(f"{victim.place}/{victim.folder}  {victim.reason}")
     gone = {(victim.place, victim.folder) for victim in victims}
-    for facts in reviews_by(root, request):
+    for facts in care.reviews_by(root, request):
         if (facts.place, facts.folder.name) not in gone:
             say(f"{facts.place}/{facts.folder.name}  review or notes: lose their author's name")
     if not options.yes and _answer(f"Type {name} to delete all of this permanently: ") != name:
         raise InvalidInputError("delete: not confirmed; nothing was removed")
     path = options.receipt or Path(f"deletion-{datetime.now(UTC):%Y%m%dT%H%M%SZ}.json")
     unsent = options.unsent and options.operator is not None
-    receipt = delete_for_good(root, request, path, checkpoints=options.checkpoints, unsent=unsent)
+    receipt = care.delete_for_good(
+        root, request, path, checkpoints=options.checkpoints, unsent=unsent
+    )
     for reference in receipt.remaining:
         say(f"{reference.where}  still names {', '.join(reference.names)}")
     for place in receipt.unreadable:
@@ -411,7 +389,7 @@ def deletions(context: Context) -> Outcome:
     """List permanent deletions and what stations have yet to remove."""
     from services.episode_store.deletions import deletion_statuses
 
-    options, records = context.options, DeletionRecords(context.need_local_root())
+    options, records = context.options, care.DeletionRecords(context.need_local_root())
     if options.readmit is not None:
         if not records.readmit(options.readmit):
             raise NotFoundError(f"deletions: no deleted operator {options.readmit!r}")
@@ -472,16 +450,16 @@ def repair(context: Context) -> Outcome:
     """Repair damaged items from a copy, and salvage the rest."""
     root, options = context.need_local_root(), context.options
     copies = EpisodeStore(options.source) if options.source else None
-    reports = [] if options.ids else repair_uploads(root)
+    reports = [] if options.ids else care.repair_uploads(root)
     for kind, item_id in context.items():
-        reports.append(repair_group(root, kind, item_id, copy=_copy(copies, kind, item_id)))
+        reports.append(care.repair_group(root, kind, item_id, copy=_copy(copies, kind, item_id)))
     for report in reports:
         say(f"{report.item_id}  {report.action}" + f"  as {report.new_id}" * bool(report.new_id))
         for name, count in report.lost.items():
             say(f"  {name}: {count} samples lost")
         for text in report.notes:
             say(f"  {text}")
-    left = any(report.action == LEFT for report in reports)
+    left = any(report.action == care.LEFT for report in reports)
     return {"reports": [asdict(r) for r in reports]}, EXIT_DAMAGED if left else 0
 
 

@@ -98,8 +98,7 @@ class CommitProcess:
     ) -> dict[str, int]:
         """Commit a spool; raises as `commit_spool`.
 
-        Raises:
-            UnavailableError: the process died; the spool is unchanged.
+        Raises UnavailableError: the process died; the spool is unchanged.
         """
         with self._guard:
             if self._child is None or not self._child.is_running:

@@ -1,7 +1,4 @@
-"""What became of permanently deleted takes: refused uploads, and stations that remove their copies.
-
-Deletions are made by `dextouch store delete` on the same folder, also while the service runs.
-"""
+"""Permanently deleted takes: refused uploads, and stations that remove their copies."""
 
 from collections import defaultdict
 from typing import Annotated, Final
@@ -36,9 +33,8 @@ Checked = Annotated[CheckTakes, Depends(JsonBody(CheckTakes))]
 def refuse_deleted(records: DeletionRecords, attributes: RecordingAttributes) -> None:
     """Refuse a recording that was deleted permanently, or whose operator was.
 
-    Raises:
-        ConflictError: with the reason `take_deleted`, or `operator_deleted` where the take began
-            after the deletion.
+    Raises ConflictError: with the reason `take_deleted`, or `operator_deleted` where the take began
+    after the deletion.
     """
     covered = records.find(TakeFacts.of(attributes))
     if covered is None:

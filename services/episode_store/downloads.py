@@ -65,7 +65,6 @@ class _Collected:
         self._pieces: list[bytes] = []
 
     def write(self, data: bytes, /) -> int:
-        """Keep a piece."""
         self._pieces.append(bytes(data))
         return len(data)
 
@@ -73,7 +72,6 @@ class _Collected:
         """Nothing waits."""
 
     def take(self) -> bytes:
-        """What was written since the last call."""
         taken, self._pieces = b"".join(self._pieces), []
         return taken
 
@@ -127,7 +125,7 @@ class Downloads:
             raise LimitExceededError(
                 f"download: got {len(items)} items, expected at most {most}; {COMMAND}"
             )
-        readers = [self._open(item) for item in items]
+        readers = [self._store.open_item(item.kind, item.id) for item in items]
         if not wanted.with_rejected:
             readers = [one for one in readers if not is_rejected(self._store, one.attributes)]
         if not readers:
@@ -153,10 +151,6 @@ class Downloads:
         except BaseException:
             self._free.release()
             raise
-
-    def _open(self, item: StoredItem) -> Reader:
-        opened = self._store.recording if item.kind == "recording" else self._store.open
-        return opened(item.id)
 
     def _response(self, readers: Sequence[Reader], num_bytes: int) -> StreamedResponse:
         folder = _Folder(self._store.root, readers)

@@ -7,23 +7,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from dextouch.command_line import say
-from dextouch.episodes import EpisodeStore, Kind
-from dextouch.episodes.editing import (
-    BackupReport,
-    EditOptions,
-    MergeOptions,
-    MergeReport,
-    add_note,
-    back_up,
-    merge_stores,
-    relabel_item,
-    remove_note,
-    restore_backup,
-    steps_between,
-    trim_episode,
-    trim_recording,
-    zero_ns,
-)
+from dextouch.episodes import EpisodeStore, Kind, editing
 from dextouch.errors import DexTouchError, InvalidInputError, NotFoundError
 from dextouch.schemas import EditedItem, NewNote, TimedNote, first_problems, json_ready
 from services.episode_store.command_context import Context, Outcome
@@ -43,14 +27,14 @@ def trim(context: Context) -> Outcome:
     if options.steps is None and not in_seconds:
         raise InvalidInputError("trim: got no span, expected --from, --to or --steps")
     if kind == "recording":
-        result = trim_recording(
+        result = editing.trim_recording(
             store, options.id, options.from_s, options.to_s, outcome=options.outcome, options=edit
         )
     else:
         steps = options.steps
         if steps is None:
-            steps = steps_between(store.open(options.id), options.from_s, options.to_s)
-        result = trim_episode(
+            steps = editing.steps_between(store.open(options.id), options.from_s, options.to_s)
+        result = editing.trim_episode(
             store,
             options.id,
             (steps[0], steps[1]),
@@ -76,7 +60,7 @@ def relabel(context: Context) -> Outcome:
     refused: dict[str, str] = {}
     for item_id in options.ids:
         try:
-            result = relabel_item(
+            result = editing.relabel_item(
                 context.store,
                 item_id,
                 changes,
@@ -96,9 +80,9 @@ def relabel(context: Context) -> Outcome:
     return found, EXIT_REFUSED if refused else 0
 
 
-def _edit_options(context: Context) -> EditOptions:
+def _edit_options(context: Context) -> editing.EditOptions:
     options = context.options
-    return EditOptions(new_id=options.new_id, keep=options.keep, dry_run=options.dry_run)
+    return editing.EditOptions(new_id=options.new_id, keep=options.keep, dry_run=options.dry_run)
 
 
 def _say_edit(context: Context, result: EditedItem) -> None:
@@ -121,14 +105,14 @@ def merge(context: Context) -> Outcome:
         if source.folders and not source.root.is_dir():
             raise NotFoundError(f"merge: store {source.root}: no such folder")
 
-    def show(report: MergeReport) -> None:
+    def show(report: editing.MergeReport) -> None:
         renamed = f"as {report.new_id}" if report.new_id not in {"", report.item_id} else ""
         remarks = f"with its {', '.join(report.remarks)}" if report.remarks else ""
         texts = (report.item_id, report.kind, report.action, renamed, remarks, report.reason)
         say("  ".join(text for text in texts if text))
 
-    merge_options = MergeOptions(rename=options.rename, dry_run=options.dry_run)
-    reports = merge_stores(sources, context.store, options=merge_options, on_item=show)
+    merge_options = editing.MergeOptions(rename=options.rename, dry_run=options.dry_run)
+    reports = editing.merge_stores(sources, context.store, options=merge_options, on_item=show)
     counts = {
         action: sum(one.action == action for one in reports)
         for action in ("copied", "there", "refused")
@@ -142,24 +126,26 @@ def backup(context: Context) -> Outcome:
     """Bring a backup of the store up to date."""
     options, target = context.options, EpisodeStore(context.options.target)
     accept = options.accept_deletions
-    reports = back_up(context.store, target, accept_deletions=accept, on_item=_show_backed_up)
+    reports = editing.back_up(
+        context.store, target, accept_deletions=accept, on_item=_show_backed_up
+    )
     return _backup_outcome(reports, f"backup of {context.url} in {target.url}")
 
 
 def restore_of_backup(context: Context) -> Outcome:
     """Restore the store from a backup, and verify it."""
     source = EpisodeStore(context.options.source)
-    reports = restore_backup(source, context.store, on_item=_show_backed_up)
+    reports = editing.restore_backup(source, context.store, on_item=_show_backed_up)
     return _backup_outcome(reports, f"{context.url} restored from {source.url} and verified")
 
 
-def _show_backed_up(report: BackupReport) -> None:
+def _show_backed_up(report: editing.BackupReport) -> None:
     if report.action != "there":
         texts = (report.item_id, report.kind, report.action, report.reason)
         say("  ".join(text for text in texts if text))
 
 
-def _backup_outcome(reports: list[BackupReport], what: str) -> Outcome:
+def _backup_outcome(reports: list[editing.BackupReport], what: str) -> Outcome:
     counts = Counter[str](report.action for report in reports)
     failed = counts["refused"] + counts["damaged"]
     listed = ", ".join(f"{count} {action}" for action, count in sorted(counts.items()))
@@ -172,7 +158,7 @@ def note(context: Context) -> Outcome:
     options, store = context.options, context.store
     kind: Kind = context.kind_of(options.id)
     reader = store.open_item(kind, options.id)
-    zero = zero_ns(reader)
+    zero = editing.zero_ns(reader)
     if options.text is not None and options.remove is not None:
         raise InvalidInputError("note: --text and --remove exclude each other")
     if options.text is not None:
@@ -186,11 +172,11 @@ def note(context: Context) -> Outcome:
             given = NewNote.model_validate(fields)
         except ValidationError as error:
             raise InvalidInputError(f"note: {first_problems(error)}") from error
-        add_note(store, options.id, given, kind=kind)
+        editing.add_note(store, options.id, given, kind=kind)
     elif options.from_s is not None or options.to_s is not None or options.author is not None:
         raise InvalidInputError("note: --from, --to and --author go with --text")
     elif options.remove is not None:
-        remove_note(store, options.id, options.remove, kind=kind)
+        editing.remove_note(store, options.id, options.remove, kind=kind)
     notes = store.notes(options.id, kind=kind).notes
     for one in notes:
         say(_note_line(one, zero))

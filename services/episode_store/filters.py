@@ -70,8 +70,7 @@ class Condition:
 def quality_bound(text: str) -> tuple[str, float]:
     """Parse `NAME:NUMBER` to a figure's name and lower bound.
 
-    Raises:
-        ValueError: anything else, and NaN.
+    Raises ValueError: anything else, and NaN.
     """
     name, colon, figure = text.rpartition(":")
     try:
@@ -191,8 +190,7 @@ class Page(FrozenModel):
     def num_rows(self, max_page: int) -> int:
         """Number of rows of the page; the maximum by default.
 
-        Raises:
-            LimitExceededError: above the maximum.
+        Raises LimitExceededError: above the maximum.
         """
         if self.limit is not None and self.limit > max_page:
             raise LimitExceededError(

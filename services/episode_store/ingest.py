@@ -57,8 +57,7 @@ class KeyedLocks:
     def holding(self, key: str) -> Iterator[None]:
         """Context manager that holds the lock of a key.
 
-        Raises:
-            UnavailableError: the lock was not released in `patience_s`.
+        Raises UnavailableError: the lock was not released in `patience_s`.
         """
         with self._guard:
             lock = self._locks.setdefault(key, threading.Lock())
@@ -82,10 +81,8 @@ class KeyedLocks:
 class Ingest:
     """All uploads of a store. Thread-safe, with one lock per recording.
 
-    Args:
-        store: destination of finished recordings; unfinished ones are in a folder below it.
-        settings: of the service.
-        commit: commits a complete upload; None as the settings say.
+    Unfinished ones are in a folder below the store. `commit` commits a complete upload; None as the
+    settings say.
     """
 
     def __init__(
@@ -137,9 +134,7 @@ class Ingest:
     def status(self, recording_id: str, sender: Sender = ANYONE) -> RecordingStatus:
         """Status of an upload.
 
-        Raises:
-            NotFoundError: no such upload.
-            AccessDeniedError: it is none of the sender.
+        Raises NotFoundError: no such upload; AccessDeniedError: it is none of the sender.
         """
         with self._working_on(recording_id):
             if self.is_finished(recording_id):
@@ -218,8 +213,7 @@ class Ingest:
     def expire(self, recording_id: str, *, idle_s: float) -> bool:
         """Drop an unfinished upload that has been idle for `idle_s`; whether it was dropped.
 
-        Raises:
-            UnavailableError: it is in use.
+        Raises UnavailableError: it is in use.
         """
         with self._working_on(recording_id):
             path = self._path(recording_id)

@@ -3,9 +3,9 @@
 import shutil
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -13,7 +13,7 @@ import anyio
 import structlog
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
 
-from dextouch.episodes import disk_errors, folder_bytes
+from dextouch.episodes import KINDS, Kind, disk_errors, folder_bytes
 from dextouch.episodes.spool import read_attributes
 from dextouch.errors import LimitExceededError, NotFoundError, StorageError, StorageFullError
 from dextouch.schemas import BatchReceipt, RecordingAttributes, UploadList, UploadSummary
@@ -50,8 +50,7 @@ class Admission:
     def admitted(self, num_bytes: int) -> Iterator[None]:
         """Context manager that counts a body of this size while it is read and written.
 
-        Raises:
-            LimitExceededError: with `retry_after_s`, so the answer is 429.
+        Raises LimitExceededError: with `retry_after_s`, so the answer is 429.
         """
         full = self._num_requests >= self._max_requests or (
             self._num_requests and self._num_bytes + num_bytes > self._max_bytes
@@ -81,23 +80,13 @@ def free_bytes_of(folder: Path) -> int:
         return shutil.disk_usage(folder).free
 
 
-@dataclass
-class _Account:
-    station: str
-    num_bytes: int
-
-
 class StorageLimits:
     """Disk usage by uploads: a reserve stays free, and each station keeps to its quota.
 
     Unfinished uploads and finished recordings count. The reserve is for finishing uploads, which
     copies them. Thread-safe. Every check raises StorageFullError with `retry_after_s`; nothing was
-    written then.
-
-    Args:
-        folder: of the unfinished uploads.
-        settings: with the quota and the reserve.
-        recordings: bytes of finished recordings by station.
+    written then. `folder` has the unfinished uploads; `recordings` tells the bytes of finished
+    recordings by station.
     """
 
     def __init__(
@@ -110,8 +99,9 @@ class StorageLimits:
         self._folder, self._recordings = folder, recordings
         self._quota, self._min_free = settings.quota_bytes_per_station, settings.min_free_bytes
         self._guard = threading.Lock()
-        self._accounts: dict[str, _Account] = {
-            path.name: _Account(attributes.station, folder_bytes(path))
+        # Station and bytes of unfinished uploads.
+        self._uploads: dict[str, tuple[str, int]] = {
+            path.name: (attributes.station, folder_bytes(path))
             for path, attributes in self._spools()
         }
         self._finished: tuple[float, dict[str, int]] | None = None
@@ -119,7 +109,7 @@ class StorageLimits:
     @property
     def num_open(self) -> int:
         """Number of unfinished uploads."""
-        return len(self._accounts)
+        return len(self._uploads)
 
     def free_bytes(self) -> int:
         """Free bytes of the disk, including the reserve."""
@@ -133,30 +123,29 @@ class StorageLimits:
     def check_batch(self, recording_id: str, num_bytes: int) -> None:
         """Check that so many bytes of an upload may come."""
         self._check_disk(num_bytes, self._min_free, "upload")
-        account = self._accounts.get(recording_id)
-        if account is not None:
-            self._check_quota(account.station, num_bytes)
+        if (upload := self._uploads.get(recording_id)) is not None:
+            self._check_quota(upload[0], num_bytes)
 
     def check_finish(self, recording_id: str) -> None:
         """Check that an upload can be copied; this may use the reserve."""
-        account = self._accounts.get(recording_id)
-        self._check_disk(0 if account is None else account.num_bytes, 0, "finish")
+        self._check_disk(self._uploads.get(recording_id, ("", 0))[1], 0, "finish")
 
     def begin(self, attributes: RecordingAttributes) -> None:
         """Register a new upload."""
         with self._guard:
-            self._accounts.setdefault(attributes.recording_id, _Account(attributes.station, 0))
+            self._uploads.setdefault(attributes.recording_id, (attributes.station, 0))
 
     def add(self, recording_id: str, num_bytes: int) -> None:
         """Add bytes of an upload."""
         with self._guard:
-            if recording_id in self._accounts:
-                self._accounts[recording_id].num_bytes += num_bytes
+            if recording_id in self._uploads:
+                station, before = self._uploads[recording_id]
+                self._uploads[recording_id] = station, before + num_bytes
 
     def end(self, recording_id: str) -> None:
         """Unregister an upload that was finished or dropped."""
         with self._guard:
-            self._accounts.pop(recording_id, None)
+            self._uploads.pop(recording_id, None)
             self._finished = None
 
     def idle(self, *, idle_s: float) -> UploadList:
@@ -193,7 +182,7 @@ class StorageLimits:
         with self._guard:
             if self._finished is None or now - self._finished[0] > REFRESH_S:
                 self._finished = (now, self._recordings())
-            uploads = (a.num_bytes for a in self._accounts.values() if a.station == station)
+            uploads = (size for whose, size in self._uploads.values() if whose == station)
             used = self._finished[1].get(station, 0) + sum(uploads)
         if used + num_bytes > self._quota:
             raise StorageFullError(
@@ -218,14 +207,9 @@ class StorageLimits:
 
 
 class UploadMetrics:
-    """Prometheus metrics of a store, in a `registry`: uploads, and what the limits measure.
+    """Prometheus metrics of a store, in a `registry`: uploads, and what the limits measure."""
 
-    Args:
-        limits: of the store's disk.
-        num_items: how many recordings and episodes are stored, by kind.
-    """
-
-    def __init__(self, limits: StorageLimits, num_items: Mapping[str, Callable[[], int]]) -> None:
+    def __init__(self, limits: StorageLimits, num_items: Callable[[Kind], int]) -> None:
         registry = self.registry = CollectorRegistry()
         text = "Acknowledged batches; replayed ones were stored before."
         self.batches = Counter("dextouch_store_batches", text, ("replayed",), registry=registry)
@@ -252,8 +236,8 @@ class UploadMetrics:
             Gauge(f"dextouch_store_{name}", text, registry=registry).set_function(measure)
         text = "Recordings and episodes in the catalog, as it was last read."
         items = Gauge("dextouch_store_items", text, ("kind",), registry=registry)
-        for kind, count in num_items.items():
-            items.labels(kind).set_function(count)
+        for kind in KINDS:
+            items.labels(kind).set_function(partial(num_items, kind))
 
     def count(self, receipt: BatchReceipt, *, num_bytes: int, took_s: float) -> None:
         """Count a batch of so many bytes that was acknowledged in `took_s` after its admission."""

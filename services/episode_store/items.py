@@ -49,9 +49,7 @@ MIN_ITEMS: Final = 8
 
 
 def item_of(
-    reader: EpisodeReader | RecordingReader,
-    summary: EpisodeSummary | RecordingSummary,
-    review: Review | None,
+    reader: EpisodeReader | RecordingReader, summary: EpisodeSummary | RecordingSummary
 ) -> CatalogItem:
     """The row of an item on its own."""
     about = reader.attributes
@@ -69,7 +67,7 @@ def item_of(
     figures = figures_of(about, num_steps=num_steps, duration_s=duration_s)
     fields |= {"id": reader.item_id, "duration_s": duration_s, "figures": figures}
     fields["findings"] = beyond_limits(about, figures)
-    return CatalogItem.model_validate(fields | {"review": review})
+    return CatalogItem.model_validate(fields)
 
 
 @dataclass(frozen=True)
@@ -228,12 +226,12 @@ def spread_of(values: Float64[np.ndarray, "items figures"]) -> Spread:
     NaN of figures that fewer than MIN_ITEMS have; items without a figure have NaN.
     """
     spread = np.full((2, values.shape[1]), np.nan)
-    for place, figure in enumerate(FIGURES):
-        known = values[:, place][~np.isnan(values[:, place])]
+    for column, figure in enumerate(FIGURES):
+        known = values[:, column][~np.isnan(values[:, column])]
         if len(known) >= MIN_ITEMS:
             median = np.median(known)
             sigma = float(np.median(np.abs(known - median))) / MAD_OF_SIGMA
-            spread[:, place] = median, max(sigma, figure.resolution)
+            spread[:, column] = median, max(sigma, figure.resolution)
     return spread
 
 
@@ -252,15 +250,15 @@ def outliers_of(figures: Mapping[str, float], spread: Spread | None) -> list[Fin
     if spread is None:
         return found
     values = figure_row(figures)
-    for place in np.flatnonzero(outlier_scores(values[None], spread)[0]):
-        figure, value, median = FIGURES[place], float(values[place]), float(spread[0, place])
+    for column in np.flatnonzero(outlier_scores(values[None], spread)[0]):
+        figure, value, median = FIGURES[column], float(values[column]), float(spread[0, column])
         one = Finding(
             code="outlier",
             message=f"{figure.label} {figure.text(value)}, usually {figure.text(median)}",
             figure=figure.name,
             value=value,
             median=median,
-            score=(value - median) / float(spread[1, place]),
+            score=(value - median) / float(spread[1, column]),
         )
         found.append(one)
     return found

@@ -131,8 +131,7 @@ Reader = Annotated[Sender, Depends(_sender("store_read"))]
 def owner_of(folder: Path) -> str | None:
     """Name of the key that began an upload; None if none is kept.
 
-    Raises:
-        StorageError: the file is damaged.
+    Raises StorageError: the file is damaged.
     """
     with disk_errors(f"read the sender of upload {folder.name!r}"):
         try:
@@ -173,14 +172,9 @@ class Token:
 
 
 class Enrolments:
-    """Issues tokens and keys of stations; thread-safe, for one process.
+    """Issues tokens and keys of stations, which a file keeps; thread-safe, for one process.
 
-    Args:
-        path: file of the keys.
-        clock_s: tells the time.
-
-    Raises:
-        StorageError: the file cannot be read.
+    Raises StorageError if the file cannot be read.
     """
 
     def __init__(self, path: Path, *, clock_s: Callable[[], float] = time.monotonic) -> None:
@@ -200,21 +194,19 @@ class Enrolments:
         """All enrolments, newest first."""
         with self._lock:
             fields = [one.model_dump(exclude={"key_sha256"}) for one in self._kept]
-            shown = [StationEnrolment.model_validate(one) for one in fields]
+            listed = [StationEnrolment.model_validate(one) for one in fields]
             for token in self._tokens:
                 if not token.is_used:
                     state = "waiting" if token.end_s > self._clock_s() else "expired"
-                    shown.append(token.enrolment.model_copy(update={"state": state}))
-        shown.sort(key=lambda one: one.requested_at, reverse=True)
-        return StationEnrolments(enrolments=tuple(shown), needs_key=self._access.has_keys)
+                    listed.append(token.enrolment.model_copy(update={"state": state}))
+        listed.sort(key=lambda one: one.requested_at, reverse=True)
+        return StationEnrolments(enrolments=tuple(listed), needs_key=self._access.has_keys)
 
     def issue(self, station: str, *, by: str, renew: bool = False) -> EnrolmentToken:
         """Issue a token for a station, in place of an earlier unused one.
 
-        With `renew` the key that the station has stays valid beside the new one.
-
-        Raises:
-            ConflictError: the store needs no keys, or has a key of this name.
+        With `renew` the key that the station has stays valid beside the new one. Raises
+        ConflictError: the store needs no keys, or has a key of this name.
         """
         if not self._access.has_keys:
             raise ConflictError(
@@ -247,11 +239,7 @@ class Enrolments:
         return EnrolmentToken(station=station, token=token, expires_at=enrolment.expires_at)
 
     def exchange(self, text: str, *, client: str) -> StationKey:
-        """Exchange a token for a key, once.
-
-        Args:
-            text: the token.
-            client: address of the station.
+        """Exchange a token for a key, once; `client` is the address of the station.
 
         Raises:
             AccessDeniedError: an unknown, used or expired token.
@@ -276,12 +264,9 @@ class Enrolments:
     def revoke(self, station: str, *, by: str, former: bool = False) -> None:
         """Refuse the keys of a station from now on, or its unused token.
 
-        With `former` its newest key stays valid.
-
-        Raises:
-            NotFoundError: the station has neither.
-            StorageError: the key is refused, but would be accepted again after a restart of the
-                service; a repetition tries to save this again.
+        With `former` its newest key stays valid. Raises NotFoundError if the station has neither,
+        StorageError if the key is refused, but would be accepted again after a restart of the
+        service: a repetition tries to save this again.
         """
         with self._lock:
             num_unused = 0 if former else self._forget_unused(station)

@@ -3,9 +3,11 @@
 import argparse
 import math
 from pathlib import Path
+from typing import TypeAlias
 
 from dextouch.command_line import CommandParser, add_json
 
+_Commands: TypeAlias = "argparse._SubParsersAction[CommandParser]"  # noqa: SLF001 - has no public name
 _UNITS = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86_400.0}
 _DELETIONS = "list permanent deletions and what stations have yet to remove"
 
@@ -52,7 +54,7 @@ def store_parser() -> argparse.ArgumentParser:
     listing.add_argument("--task", metavar="TASK", help="only of this task")
     listing.add_argument("--domain", choices=("human", "robot"), help="only of these hands")
     listing.add_argument("--origin", choices=("recorded", "twin", "imagined"), help="episodes only")
-    listing.add_argument("--trash", action="store_true", help="list the trash instead")
+    _add_flag(listing, "--trash", "list the trash instead")
     show = _command(commands, kind, "show", "show attributes and streams of an item", "take-7")
     show.add_argument("id", metavar="ID", help="of an episode or recording")
     _add_ids(_command(commands, kind, "verify", "verify all checksums and list damage"))
@@ -96,15 +98,11 @@ def store_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _add_edits(commands: "argparse._SubParsersAction[CommandParser]", kind: CommandParser) -> None:
+def _add_edits(commands: _Commands, kind: CommandParser) -> None:
     """Add the commands that make new items of others."""
     edit = CommandParser(add_help=False)
-    _add_dry_run(edit)
-    edit.add_argument(
-        "--keep",
-        action="store_true",
-        help="keep the source as superseded, not in the trash",
-    )
+    _add_flag(edit, "--dry-run", "only say what would happen")
+    _add_flag(edit, "--keep", "keep the source as superseded, not in the trash")
     edit.add_argument(
         "--as", dest="new_id", metavar="ID", help="of the result (default: ID-trimmed-1 …)"
     )
@@ -121,9 +119,7 @@ def _add_edits(commands: "argparse._SubParsersAction[CommandParser]", kind: Comm
     trim.add_argument(
         "--steps", type=int, nargs=2, metavar=("FIRST", "STOP"), help="steps FIRST … STOP - 1"
     )
-    trim.add_argument(
-        "--exact", action="store_true", help="encode H.264 anew where a group is cut in two"
-    )
+    _add_flag(trim, "--exact", "encode H.264 anew where a group is cut in two")
     does = "write items with other attributes as new ones"
     usual = "take-7 take-8 --instruction 'stand the bottle up'"
     relabel = _command(commands, both, "relabel", does, usual)
@@ -140,7 +136,7 @@ def _add_edits(commands: "argparse._SubParsersAction[CommandParser]", kind: Comm
     note.add_argument("--remove", type=int, metavar="N", help="remove the note of this number")
     own = CommandParser(add_help=False)
     add_json(own)
-    _add_dry_run(own)
+    _add_flag(own, "--dry-run", "only say what would happen")
     does = "copy all items of stores into one"
     merge = _command(
         commands, (own,), "merge", does, "bench-1/store bench-2/store --into data/store"
@@ -149,29 +145,23 @@ def _add_edits(commands: "argparse._SubParsersAction[CommandParser]", kind: Comm
     merge.add_argument(
         "--into", dest="store", required=True, metavar="URL", help="store to copy into"
     )
-    merge.add_argument(
-        "--rename", action="store_true", help="give items a new id where it is taken"
-    )
+    _add_flag(merge, "--rename", "give items a new id where it is taken")
 
 
-def _add_backups(
-    commands: "argparse._SubParsersAction[CommandParser]", shared: CommandParser
-) -> None:
+def _add_backups(commands: _Commands, shared: CommandParser) -> None:
     does = "bring a backup up to date, while the store is in use"
     backup = _command(commands, shared, "backup", does, "/mnt/backup/store")
     backup.add_argument("target", metavar="TO", help="folder on another disk, or s3://…")
-    backup.add_argument(
-        "--accept-deletions",
-        action="store_true",
-        help="also if more than half of the backup is gone from the store",
+    _add_flag(
+        backup, "--accept-deletions", "also if more than half of the backup is gone from the store"
     )
     does = "restore a store from its backup, and verify it"
     restoring = _command(commands, shared, "restore-backup", does, "/mnt/backup/store")
     restoring.add_argument("source", metavar="FROM", help="the backup")
 
 
-def _add_dry_run(command: argparse.ArgumentParser) -> None:
-    command.add_argument("--dry-run", action="store_true", help="only say what would happen")
+def _add_flag(command: argparse.ArgumentParser, name: str, does: str) -> None:
+    command.add_argument(name, action="store_true", help=does)
 
 
 def _add_span(command: argparse.ArgumentParser, what: str) -> None:
@@ -180,7 +170,7 @@ def _add_span(command: argparse.ArgumentParser, what: str) -> None:
 
 
 def _command(
-    commands: "argparse._SubParsersAction[CommandParser]",
+    commands: _Commands,
     shared: CommandParser | tuple[CommandParser, ...],
     name: str,
     does: str,
@@ -212,18 +202,16 @@ def _add_deletions(command: argparse.ArgumentParser) -> None:
 
 def _add_delete(command: argparse.ArgumentParser) -> None:
     command.add_argument("ids", nargs="*", metavar="ID", help="of what is deleted")
-    command.add_argument(
-        "--for-good", action="store_true", help="delete permanently, without trash"
-    )
+    _add_flag(command, "--for-good", "delete permanently, without trash")
     command.add_argument("--operator", metavar="P", help="all data of this operator pseudonym")
     command.add_argument("--recording", metavar="ID", help="delete this recording")
-    command.add_argument("--derived", action="store_true", help="also everything derived from it")
-    command.add_argument(
+    _add_flag(command, "--derived", "also everything derived from it")
+    _add_flag(
+        command,
         "--unsent",
-        action="store_true",
-        help="with --operator: also if the store has nothing of him and only stations may",
+        "with --operator: also if the store has nothing of him and only stations may",
     )
-    command.add_argument("--yes", action="store_true", help="skip the confirmation")
+    _add_flag(command, "--yes", "skip the confirmation")
     command.add_argument(
         "--receipt", type=Path, metavar="PATH", help="file for the deletion receipt"
     )

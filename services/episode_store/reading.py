@@ -1,8 +1,4 @@
-"""HTTP routes of single items: attributes, windows and samples, and what players show.
-
-Answers with samples are msgpack with ETags. Signals are reduced to the lowest and highest value per
-bin of time, for plots.
-"""
+"""HTTP routes of single items: attributes, windows and samples, and what players show."""
 
 import hashlib
 from collections.abc import Callable, Iterator
@@ -93,6 +89,9 @@ class SpanQuery(FrozenModel):
     stop_ns: int | None = None
 
 
+Span = Annotated[SpanQuery, Query()]
+
+
 def content_router(store: EpisodeStore, settings: EpisodeStoreSettings) -> APIRouter:
     """Create the routes of single recordings and episodes; sizes are checked before reading."""
     router = APIRouter(prefix="/v1", dependencies=[MAY_READ])
@@ -107,15 +106,12 @@ def content_router(store: EpisodeStore, settings: EpisodeStoreSettings) -> APIRo
         "/recordings/{recording_id}/streams/{stream}", tags=["recordings"], **_answers(MSGPACK)
     )
     def get_recording_samples(
-        recording_id: str,
-        stream: str,
-        span: Annotated[SpanQuery, Query()],
-        if_none_match: IfNoneMatch = None,
+        recording_id: str, stream: str, span: Span, known: IfNoneMatch = None
     ) -> Response:
         """Samples of a finished recording with start_ns ≤ t_host_ns < stop_ns, as msgpack."""
         reader = store.recording(recording_id)
         read = partial(_samples, reader, stream, span, max_bytes)
-        return response(etag_of(reader, stream, span), if_none_match, read, MSGPACK)
+        return response(etag_of(reader, stream, span), known, read)
 
     @router.get("/episodes/{episode_id}", tags=["episodes"])
     def get_episode(episode_id: str) -> EpisodeDetail:
@@ -129,31 +125,30 @@ def content_router(store: EpisodeStore, settings: EpisodeStoreSettings) -> APIRo
 
     @router.get("/episodes/{episode_id}/windows", tags=["episodes"], **_answers(WINDOW_MSGPACK))
     def get_episode_window(
-        episode_id: str, query: Annotated[WindowQuery, Query()], if_none_match: IfNoneMatch = None
+        episode_id: str, query: Annotated[WindowQuery, Query()], known: IfNoneMatch = None
     ) -> Response:
         """Window of the model grid as msgpack (`dextouch.episodes.decode_window`)."""
         text = f"window: got {query.num_steps} steps, expected at most {max_steps}"
         _check_limit(query.num_steps, max_steps, text)
         reader = store.open(episode_id)
         read = partial(_window, reader, query, max_bytes)
-        return response(etag_of(reader, "window", query), if_none_match, read, WINDOW_MSGPACK)
+        return response(etag_of(reader, "window", query), known, read, WINDOW_MSGPACK)
 
     @router.get("/episodes/{episode_id}/streams/{stream}", tags=["episodes"], **_answers(MSGPACK))
     def get_episode_samples(
-        episode_id: str,
-        stream: str,
-        span: Annotated[SpanQuery, Query()],
-        if_none_match: IfNoneMatch = None,
+        episode_id: str, stream: str, span: Span, known: IfNoneMatch = None
     ) -> Response:
         """Samples with start_ns ≤ t_ref_ns < stop_ns as msgpack."""
         reader = store.open(episode_id)
         read = partial(_samples, reader, stream, span, max_bytes)
-        return response(etag_of(reader, stream, span), if_none_match, read, MSGPACK)
+        return response(etag_of(reader, stream, span), known, read)
 
     return router
 
 
-def response(etag: str, known: str | None, read: Callable[[], bytes], media_type: str) -> Response:
+def response(
+    etag: str, known: str | None, read: Callable[[], bytes], media_type: str = MSGPACK
+) -> Response:
     """Response with ETag; 304 without a body if the client has it already."""
     headers = {"etag": etag, "cache-control": CACHE_CONTROL}
     if is_known(etag, known):
@@ -280,6 +275,9 @@ class ImagesQuery(SpanQuery):
     half_size: bool = False
 
 
+Images = Annotated[ImagesQuery, Query()]
+
+
 class SignalsQuery(FrozenModel):
     """Query of signals, a comma-separated list, in `points` bins of [start_ns, stop_ns).
 
@@ -293,6 +291,9 @@ class SignalsQuery(FrozenModel):
     points: int = Field(default=600, ge=1, le=4000)
 
 
+Signals = Annotated[SignalsQuery, Query()]
+
+
 def playback_router(store: EpisodeStore, settings: EpisodeStoreSettings) -> APIRouter:
     """Create the routes below /v1/playback; sizes are checked before reading."""
     router = APIRouter(prefix="/v1/playback", dependencies=[MAY_READ], tags=["playback"])
@@ -304,37 +305,31 @@ def playback_router(store: EpisodeStore, settings: EpisodeStoreSettings) -> APIR
 
     @router.get("/{kind}/{item_id}/images/{camera}", **_answers(MSGPACK))
     def get_playback_images(
-        kind: ItemKind,
-        item_id: str,
-        camera: str,
-        query: Annotated[ImagesQuery, Query()],
-        if_none_match: IfNoneMatch = None,
+        kind: ItemKind, item_id: str, camera: str, query: Images, known: IfNoneMatch = None
     ) -> Response:
         """JPEG images of a span: arrays `t_ns`, `num_bytes` of each, and `data`, one by one."""
         reader = store.open_item(kind, item_id)
         read = partial(_images, reader, camera, query, settings.max_answer_bytes)
-        return response(etag_of(reader, f"jpeg {camera}", query), if_none_match, read, MSGPACK)
+        return response(etag_of(reader, f"jpeg {camera}", query), known, read)
 
     @router.get("/{kind}/{item_id}/signals", **_answers(MSGPACK))
     def get_playback_signals(
-        kind: ItemKind,
-        item_id: str,
-        query: Annotated[SignalsQuery, Query()],
-        if_none_match: IfNoneMatch = None,
+        kind: ItemKind, item_id: str, query: Signals, known: IfNoneMatch = None
     ) -> Response:
         """Lowest and highest value per bin of time: arrays `NAME/low`, `NAME/high` [points]."""
         reader = store.open_item(kind, item_id)
-        read: Callable[[], bytes] = partial(reduce_signals, reader, query)
-        return response(etag_of(reader, "signals", query), if_none_match, read, MSGPACK)
+        return response(
+            etag_of(reader, "signals", query), known, lambda: reduce_signals(reader, query)
+        )
 
     @router.get("/episode/{item_id}/robot_hands", **_answers(MSGPACK))
     def get_playback_robot_hands(
-        item_id: str, query: Annotated[RobotHandsQuery, Query()], if_none_match: IfNoneMatch = None
+        item_id: str, query: Annotated[RobotHandsQuery, Query()], known: IfNoneMatch = None
     ) -> Response:
         """Points of both robot hands in the world, from the actions of a span."""
         reader = store.open(item_id)
         read = partial(robot_hands, reader, query)
-        return response(etag_of(reader, "robot_hands", query), if_none_match, read, MSGPACK)
+        return response(etag_of(reader, "robot_hands", query), known, read)
 
     return router
 

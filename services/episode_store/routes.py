@@ -14,39 +14,12 @@ import numpy as np
 import structlog
 from fastapi import APIRouter, Depends, Path, Query, Request
 
-from dextouch.episodes import KINDS, EpisodeStore, clicked_poses, first_camera
+from dextouch import schemas
+from dextouch.episodes import KINDS, EpisodeStore, Kind, clicked_poses, first_camera
+from dextouch.episodes.editing import EditOptions, add_note, relabel_item, remove_note, trim_episode
 from dextouch.errors import DexTouchError, NotFoundError, StorageFullError
 from dextouch.frozen_model import FrozenModel
 from dextouch.geometry import box_pixels, transform_from_pose
-from dextouch.schemas import (
-    BatchReceipt,
-    CatalogHours,
-    CatalogItems,
-    CatalogValues,
-    ComparedGroups,
-    EpisodeClicks,
-    EpisodeList,
-    ExpireUploads,
-    FinishRecording,
-    HoursByField,
-    ItemKind,
-    Lineage,
-    MovedItems,
-    MoveItems,
-    NewRecording,
-    ObjectClicks,
-    RecordingList,
-    RecordingStatus,
-    RefusedItem,
-    Review,
-    ReviewedItems,
-    ReviewItems,
-    SceneObject,
-    StoredItem,
-    TrashContents,
-    TrashedItem,
-    UploadList,
-)
 from dextouch.serving import AS_SET, JSON, KIB, OCTETS, JsonBody, takes
 from dextouch.streams import HEAD_CAMERA, MAX_BATCH_BYTES
 from services.episode_store.catalog import Catalog
@@ -58,10 +31,11 @@ from services.episode_store.keys import MAY_DELETE, MAY_EXPIRE, MAY_READ, MAY_WR
 
 logger = structlog.get_logger(__name__)
 
-Attributes = Annotated[NewRecording, Depends(JsonBody(NewRecording))]
-Finish = Annotated[FinishRecording, Depends(JsonBody(FinishRecording))]
-# Room for the calibration and descriptors of a station, or the ledger of a take.
+Attributes = Annotated[schemas.NewRecording, Depends(JsonBody(schemas.NewRecording))]
+Finish = Annotated[schemas.FinishRecording, Depends(JsonBody(schemas.FinishRecording))]
+# Room for the calibration and descriptors of a station, the ledger of a take, or names of items.
 MAX_ATTRIBUTES_BYTES = 256 * KIB
+MAX_NOTE_BYTES = 16 * KIB
 
 
 async def _check_unless(
@@ -83,7 +57,7 @@ def uploads_router(
 
     @router.post("/recordings", status_code=201, tags=["recordings"], dependencies=[MAY_WRITE])
     @takes({JSON: MAX_ATTRIBUTES_BYTES})
-    def create_recording(given: Attributes, sender: Writer) -> RecordingStatus:
+    def create_recording(given: Attributes, sender: Writer) -> schemas.RecordingStatus:
         """Begin an upload, or return the status of an existing one."""
         attributes = given.attributes()
         sender.check_station(attributes.station)
@@ -109,7 +83,7 @@ def uploads_router(
         number: Annotated[int, Path(ge=0)],
         request: Request,
         sender: Writer,
-    ) -> BatchReceipt:
+    ) -> schemas.BatchReceipt:
         """Store batch n of a stream (wire format v2 or v1), exactly once even if repeated."""
         announced = request.headers.get("content-length", "")
         # A body of unknown length may be as large as the largest batch.
@@ -134,7 +108,9 @@ def uploads_router(
 
     @router.post("/recordings/{recording_id}/finish", tags=["recordings"], dependencies=[MAY_WRITE])
     @takes({JSON: MAX_ATTRIBUTES_BYTES})
-    def finish_recording(recording_id: str, body: Finish, sender: Writer) -> RecordingStatus:
+    def finish_recording(
+        recording_id: str, body: Finish, sender: Writer
+    ) -> schemas.RecordingStatus:
         """Commit a complete upload."""
         started = time.perf_counter()
         with metrics.counting_refusals(), _unless(partial(ingest.is_finished, recording_id)):
@@ -145,7 +121,7 @@ def uploads_router(
         return status
 
     @router.get("/recordings/{recording_id}", tags=["recordings"], dependencies=[MAY_READ])
-    def get_recording(recording_id: str, sender: Reader) -> RecordingStatus:
+    def get_recording(recording_id: str, sender: Reader) -> schemas.RecordingStatus:
         """Status of an upload, for those who may continue it, or of a finished recording."""
         return ingest.status(recording_id, sender)
 
@@ -157,19 +133,19 @@ def idle_uploads_router(ingest: Ingest, limits: StorageLimits) -> APIRouter:
     router = APIRouter(prefix="/v1")
 
     @router.get("/uploads", tags=["uploads"], dependencies=[MAY_READ])
-    def list_uploads(idle_s: Annotated[float, Query(ge=0)] = 0.0) -> UploadList:
+    def list_uploads(idle_s: Annotated[float, Query(ge=0)] = 0.0) -> schemas.UploadList:
         """List unfinished uploads that have been idle for `idle_s`."""
         return limits.idle(idle_s=idle_s)
 
     @router.post("/uploads/expire", tags=["uploads"], dependencies=[MAY_EXPIRE])
-    def expire_uploads(body: ExpireUploads) -> UploadList:
+    def expire_uploads(body: schemas.ExpireUploads) -> schemas.UploadList:
         """Drop such uploads with their data; the response lists them."""
         gone = []
         for upload in limits.idle(idle_s=body.idle_s).uploads:
             if ingest.expire(upload.recording_id, idle_s=body.idle_s):
                 limits.end(upload.recording_id)
                 gone.append(upload)
-        return UploadList(uploads=tuple(gone))
+        return schemas.UploadList(uploads=tuple(gone))
 
     return router
 
@@ -192,44 +168,44 @@ def catalog_router(catalog: Catalog, *, max_page: int) -> APIRouter:
     router = APIRouter(prefix="/v1", dependencies=[MAY_READ])
 
     @router.get("/recordings", tags=["recordings"])
-    def list_recordings(query: Annotated[RecordingQuery, Query()]) -> RecordingList:
+    def list_recordings(query: Annotated[RecordingQuery, Query()]) -> schemas.RecordingList:
         """List finished recordings that match all filters."""
         return catalog.recordings(query, limit=query.num_rows(max_page), page=query)
 
     @router.get("/episodes", tags=["episodes"])
-    def list_episodes(query: Annotated[EpisodeQuery, Query()]) -> EpisodeList:
+    def list_episodes(query: Annotated[EpisodeQuery, Query()]) -> schemas.EpisodeList:
         """List episodes that match all filters."""
         return catalog.episodes(query, limit=query.num_rows(max_page), page=query)
 
     @router.get("/catalog/hours", tags=["catalog"])
-    def get_hours(query: Annotated[EpisodeFilter, Query()]) -> CatalogHours:
+    def get_hours(query: Annotated[EpisodeFilter, Query()]) -> schemas.CatalogHours:
         """Hours and counts of the matching episodes by task, domain and origin."""
         return catalog.hours(query)
 
     @router.get("/catalog/hours/{field}", tags=["catalog"])
     def get_hours_by_field(
         field: HoursField, query: Annotated[HoursFilter, Query()]
-    ) -> HoursByField:
+    ) -> schemas.HoursByField:
         """Hours of the matching episodes by the values of one field, and by their reviews."""
         return catalog.hours_by(field, query)
 
     @router.get("/catalog/items", tags=["catalog"])
-    def list_items(query: Annotated[ItemQuery, Query()]) -> CatalogItems:
+    def list_items(query: Annotated[ItemQuery, Query()]) -> schemas.CatalogItems:
         """List recordings and episodes in one list; both as takes by default."""
         return catalog.items(query, limit=query.num_rows(max_page), page=query)
 
     @router.get("/catalog/groups", tags=["catalog"])
-    def list_compared_groups() -> ComparedGroups:
+    def list_compared_groups() -> schemas.ComparedGroups:
         """Groups of items that are compared to find outliers, and whether they are large enough."""
         return catalog.groups()
 
     @router.get("/catalog/values", tags=["catalog"])
-    def list_values() -> CatalogValues:
+    def list_values() -> schemas.CatalogValues:
         """Tasks, operators and stations that occur in the store."""
         return catalog.values()
 
     @router.get("/catalog/lineage/{kind}/{item_id}", tags=["catalog"])
-    def get_lineage(kind: ItemKind, item_id: str) -> Lineage:
+    def get_lineage(kind: schemas.ItemKind, item_id: str) -> schemas.Lineage:
         """What an item was made from, and what was made from it."""
         return catalog.lineage(kind, item_id)
 
@@ -240,13 +216,15 @@ def reviews_router(catalog: Catalog) -> APIRouter:
     """Create the route that keeps reviews."""
     router = APIRouter(prefix="/v1", dependencies=[MAY_DELETE])
 
-    @router.post("/catalog/reviews", tags=["catalog"], dependencies=[MAY_DELETE])
+    @router.post("/catalog/reviews", tags=["catalog"])
     @takes({JSON: MAX_ATTRIBUTES_BYTES})
-    def review_items(body: Annotated[ReviewItems, Depends(JsonBody(ReviewItems))]) -> ReviewedItems:
+    def review_items(
+        body: Annotated[schemas.ReviewItems, Depends(JsonBody(schemas.ReviewItems))],
+    ) -> schemas.ReviewedItems:
         """Accept or reject items, or remove their reviews; rejected ones are not trained on."""
         review = None
         if body.verdict is not None:
-            review = Review(
+            review = schemas.Review(
                 verdict=body.verdict,
                 reason=body.reason,
                 reviewer=body.reviewer,
@@ -254,7 +232,7 @@ def reviews_router(catalog: Catalog) -> APIRouter:
             )
         reviewed, refused = _each(body.items, lambda item: catalog.review(item, review))
         logger.info("items_reviewed", verdict=body.verdict, ids=[item.id for item in reviewed])
-        return ReviewedItems(reviewed=reviewed, refused=refused)
+        return schemas.ReviewedItems(reviewed=reviewed, refused=refused)
 
     return router
 
@@ -264,31 +242,25 @@ def trash_router(store: EpisodeStore, *, max_page: int) -> APIRouter:
     router = APIRouter(prefix="/v1/trash", tags=["trash"])
 
     @router.get("", dependencies=[MAY_READ])
-    def list_trash(limit: Annotated[int, Query(ge=1)] = 100) -> TrashContents:
+    def list_trash(limit: Annotated[int, Query(ge=1)] = 100) -> schemas.TrashContents:
         """Deleted episodes and recordings, newest first; refused for a store in a bucket."""
         entries = [entry for entry in store.trash_list() if entry.kind in KINDS]
         newest = entries[::-1][: min(limit, max_page)]
-        items = [
-            TrashedItem.model_validate(
-                {
-                    "kind": entry.kind,
-                    "id": entry.item_id,
-                    "deleted_at": datetime.fromtimestamp(entry.deleted_at_ns / 1_000_000_000, UTC),
-                    "num_bytes": entry.num_bytes,
-                }
-            )
-            for entry in newest
-        ]
-        return TrashContents(items=tuple(items), num_items=len(entries))
+        items = []
+        for entry in newest:
+            at = datetime.fromtimestamp(entry.deleted_at_ns / 1_000_000_000, UTC)
+            about = {"kind": entry.kind, "id": entry.item_id, "num_bytes": entry.num_bytes}
+            items.append(schemas.TrashedItem.model_validate(about | {"deleted_at": at}))
+        return schemas.TrashContents(items=tuple(items), num_items=len(entries))
 
     @router.post("", dependencies=[MAY_DELETE])
-    def delete_items(body: MoveItems) -> MovedItems:
+    def delete_items(body: schemas.MoveItems) -> schemas.MovedItems:
         """Move items to the trash; refused for a store in a bucket, which has none."""
         store.require_trash()
         return _move(body, lambda item: store.delete(item.id, kind=item.kind))
 
     @router.post("/restore", dependencies=[MAY_DELETE])
-    def restore_items(body: MoveItems) -> MovedItems:
+    def restore_items(body: schemas.MoveItems) -> schemas.MovedItems:
         """Restore items from the trash, each the one that was deleted last."""
         store.require_trash()
         return _move(body, lambda item: store.restore(item.id, kind=item.kind))
@@ -296,22 +268,24 @@ def trash_router(store: EpisodeStore, *, max_page: int) -> APIRouter:
     return router
 
 
-def _move(body: MoveItems, move: Callable[[StoredItem], None]) -> MovedItems:
+def _move(
+    body: schemas.MoveItems, move: Callable[[schemas.StoredItem], None]
+) -> schemas.MovedItems:
     moved, refused = _each(body.items, move)
     logger.info("items_moved", moved=[item.id for item in moved], num_refused=len(refused))
-    return MovedItems(moved=moved, refused=refused)
+    return schemas.MovedItems(moved=moved, refused=refused)
 
 
 def _each(
-    items: Iterable[StoredItem], change: Callable[[StoredItem], None]
-) -> tuple[tuple[StoredItem, ...], tuple[RefusedItem, ...]]:
+    items: Iterable[schemas.StoredItem], change: Callable[[schemas.StoredItem], None]
+) -> tuple[tuple[schemas.StoredItem, ...], tuple[schemas.RefusedItem, ...]]:
     """Change items, each on its own; those that were changed, and those that were refused."""
     changed, refused = [], []
     for item in items:
         try:
             change(item)
         except DexTouchError as error:
-            refused.append(RefusedItem(kind=item.kind, id=item.id, reason=error.message))
+            refused.append(schemas.RefusedItem(kind=item.kind, id=item.id, reason=error.message))
         else:
             changed.append(item)
     return tuple(changed), tuple(refused)
@@ -321,7 +295,7 @@ class ClickableEpisode(FrozenModel):
     """An episode whose objects can be clicked, and clicks that there are."""
 
     episode_id: str
-    clicks: EpisodeClicks | None
+    clicks: schemas.EpisodeClicks | None
 
 
 class ClickQueue(FrozenModel):
@@ -332,7 +306,7 @@ class ClickQueue(FrozenModel):
 
     tasks: tuple[str, ...]
     task: str
-    objects: tuple[SceneObject, ...]
+    objects: tuple[schemas.SceneObject, ...]
     episodes: tuple[ClickableEpisode, ...]
     num_matching: int
 
@@ -346,16 +320,18 @@ class ClickedEpisode(FrozenModel):
 
     episode_id: str
     image_t_ns: int
-    clicks: EpisodeClicks
+    clicks: schemas.EpisodeClicks
     boxes_px: dict[str, tuple[tuple[float, float], ...]]
     problem: str = ""
 
 
-def clicks_router(store: EpisodeStore, catalog: Catalog, objects: ObjectClicks | None) -> APIRouter:
+def clicks_router(
+    store: EpisodeStore, catalog: Catalog, objects: schemas.ObjectClicks | None
+) -> APIRouter:
     """Create the routes of clicks; without a description of the objects they are refused."""
     router = APIRouter(prefix="/v1", tags=["clicks"], responses={404: {}})
 
-    def described() -> ObjectClicks:
+    def described() -> schemas.ObjectClicks:
         if objects is None:
             raise NotFoundError(
                 "clicks: no objects are described; start the store with --objects FILE, or "
@@ -372,7 +348,7 @@ def clicks_router(store: EpisodeStore, catalog: Catalog, objects: ObjectClicks |
         return _queue(catalog, described(), task, limit)
 
     @router.get("/catalog/clicks/file", dependencies=[MAY_READ])
-    def get_clicks_file() -> ObjectClicks:
+    def get_clicks_file() -> schemas.ObjectClicks:
         """The described objects and all clicks in the store, for `train world-model --clicks`."""
         known = described()
         stored = {name: one.clicks for name, one in catalog.clickable().items() if one.clicks}
@@ -381,17 +357,18 @@ def clicks_router(store: EpisodeStore, catalog: Catalog, objects: ObjectClicks |
     @router.get("/episodes/{episode_id}/clicks", dependencies=[MAY_READ])
     def get_episode_clicks(episode_id: str) -> ClickedEpisode:
         """Clicks on the objects of an episode, and what its first image is."""
-        clicks = store.clicks(episode_id) or EpisodeClicks(objects={})
+        clicks = store.clicks(episode_id) or schemas.EpisodeClicks(objects={})
         try:
             return _clicked(store, described(), episode_id, clicks)
         except DexTouchError as error:
-            about = _clicked(store, described(), episode_id, EpisodeClicks(objects={}))
+            about = _clicked(store, described(), episode_id, schemas.EpisodeClicks(objects={}))
             return about.model_copy(update={"clicks": clicks, "problem": error.message})
 
     @router.post("/episodes/{episode_id}/clicks", dependencies=[MAY_DELETE])
-    @takes({JSON: 16 * KIB})
+    @takes({JSON: MAX_NOTE_BYTES})
     def save_episode_clicks(
-        episode_id: str, clicks: Annotated[EpisodeClicks, Depends(JsonBody(EpisodeClicks))]
+        episode_id: str,
+        clicks: Annotated[schemas.EpisodeClicks, Depends(JsonBody(schemas.EpisodeClicks))],
     ) -> ClickedEpisode:
         """Keep clicks in place of earlier ones, none to remove them; wrong ones are refused."""
         found = _clicked(store, described(), episode_id, clicks)
@@ -401,7 +378,9 @@ def clicks_router(store: EpisodeStore, catalog: Catalog, objects: ObjectClicks |
     return router
 
 
-def _queue(catalog: Catalog, objects: ObjectClicks, task: str | None, limit: int) -> ClickQueue:
+def _queue(
+    catalog: Catalog, objects: schemas.ObjectClicks, task: str | None, limit: int
+) -> ClickQueue:
     tasks = tuple(objects.tasks)
     chosen = tasks[0] if task is None and tasks else task or ""
     if chosen not in objects.tasks:
@@ -424,7 +403,10 @@ def _queue(catalog: Catalog, objects: ObjectClicks, task: str | None, limit: int
 
 
 def _clicked(
-    store: EpisodeStore, objects: ObjectClicks, episode_id: str, clicks: EpisodeClicks
+    store: EpisodeStore,
+    objects: schemas.ObjectClicks,
+    episode_id: str,
+    clicks: schemas.EpisodeClicks,
 ) -> ClickedEpisode:
     """An episode with clicks; raises as `clicked_poses`."""
     reader = store.open(episode_id)
@@ -445,3 +427,88 @@ def _clicked(
         clicks=clicks,
         boxes_px=boxes_px,
     )
+
+
+def editing_router(store: EpisodeStore, catalog: Catalog) -> APIRouter:
+    """Create the routes of edits; with `dry_run` they say what would happen."""
+    router = APIRouter(prefix="/v1", dependencies=[MAY_DELETE])
+
+    def done(kind: Kind, result: schemas.EditedItem, *, dry_run: bool) -> schemas.EditedItem:
+        if not dry_run:
+            # Their reviews have changed.
+            for source in store.open_item(kind, result.id).attributes.lineage:
+                if source.is_edit and source.kind == kind:
+                    catalog.index.reread(kind, source.id)
+            logger.info("item_edited", kind=kind, id=result.id, source=result.source_id)
+        return result
+
+    @router.post("/episodes/{episode_id}/trim", tags=["episodes"])
+    @takes({JSON: MAX_NOTE_BYTES})
+    def trim_episode_steps(
+        episode_id: str,
+        body: Annotated[schemas.TrimEpisode, Depends(JsonBody(schemas.TrimEpisode))],
+    ) -> schemas.EditedItem:
+        """Write steps of an episode as a new one, which takes its place."""
+        result = trim_episode(
+            store,
+            episode_id,
+            (body.first_step, body.stop_step),
+            outcome=body.outcome,
+            exact=body.exact,
+            options=EditOptions(keep=body.keep, dry_run=body.dry_run),
+        )
+        return done("episode", result, dry_run=body.dry_run)
+
+    @router.post("/catalog/relabel", tags=["catalog"])
+    @takes({JSON: MAX_ATTRIBUTES_BYTES})
+    def relabel_items(
+        body: Annotated[schemas.RelabelItems, Depends(JsonBody(schemas.RelabelItems))],
+    ) -> schemas.EditedItems:
+        """Write items with other attributes as new ones, which take their places."""
+        changes = body.model_dump(include={"task", "instruction", "operator"}, exclude_none=True)
+        options = EditOptions(keep=body.keep, dry_run=body.dry_run)
+        edited = []
+
+        def relabel(item: schemas.StoredItem) -> None:
+            result = relabel_item(
+                store, item.id, changes, kind=item.kind, outcome=body.outcome, options=options
+            )
+            edited.append(done(item.kind, result, dry_run=body.dry_run))
+
+        _, refused = _each(body.items, relabel)
+        return schemas.EditedItems(edited=tuple(edited), refused=refused)
+
+    return router
+
+
+def notes_router(store: EpisodeStore) -> APIRouter:
+    """Create the routes of notes, whose times are those of the item's streams in its playback."""
+    router = APIRouter(prefix="/v1/notes", tags=["notes"], responses={404: {}})
+
+    @router.get("/{kind}/{item_id}", dependencies=[MAY_READ])
+    def list_notes(kind: schemas.ItemKind, item_id: str) -> schemas.ItemNotes:
+        """Notes on an item, in the order of their starts."""
+        return store.notes(item_id, kind=kind)
+
+    @router.post("/{kind}/{item_id}", dependencies=[MAY_DELETE])
+    @takes({JSON: MAX_NOTE_BYTES})
+    def save_note(
+        kind: schemas.ItemKind,
+        item_id: str,
+        body: Annotated[schemas.NewNote, Depends(JsonBody(schemas.NewNote))],
+    ) -> schemas.ItemNotes:
+        """Add a note; the answer has all notes of the item."""
+        add_note(store, item_id, body, kind=kind)
+        return store.notes(item_id, kind=kind)
+
+    @router.post("/{kind}/{item_id}/remove", dependencies=[MAY_DELETE])
+    @takes({JSON: MAX_NOTE_BYTES})
+    def delete_note(
+        kind: schemas.ItemKind,
+        item_id: str,
+        body: Annotated[schemas.RemoveNote, Depends(JsonBody(schemas.RemoveNote))],
+    ) -> schemas.ItemNotes:
+        """Remove a note; the answer has those that are left."""
+        return remove_note(store, item_id, body.number, kind=kind)
+
+    return router

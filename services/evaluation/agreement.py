@@ -1,9 +1,4 @@
-"""Agreement of policies' scores between two worlds: figures, intervals and significance.
-
-`task_agreement` and `pooled_agreement` are what a study reports: correlations, mean maximum rank
-violation, bias and error with 95 % intervals, the influence of each policy, and how likely chance
-alone would order the policies as well. `paired_differences` compares policies inside one world.
-"""
+"""Agreement of policies' scores between two worlds: figures, intervals and significance."""
 
 import itertools
 import math
@@ -102,14 +97,8 @@ def task_agreement(
 
     Scores are those of the named policies, at least two, from at least two starts.
     """
-    real, imagined = (known_mean(side, axis=1) for side in (scores.real, scores.imagined))
     draws = Draws(posterior_scores(scores, generator), bootstrap_scores(scores, generator))
-    without = {
-        name: policy.pearson(real=np.delete(real, row), imagined=np.delete(imagined, row))
-        for row, name in enumerate(policies)
-    }
-    chance = chance_of_correlation([real], [imagined], generator)
-    return Agreement(_figures(real[None], imagined[None], draws), without, chance), draws
+    return pooled_agreement(policies, [scores], [draws], generator), draws
 
 
 def pooled_agreement(
@@ -128,7 +117,13 @@ def pooled_agreement(
     real = np.array([known_mean(scores.real, axis=1) for scores in tasks])
     imagined = np.array([known_mean(scores.imagined, axis=1) for scores in tasks])
     joined = Draws(
-        _joined([one.posterior for one in draws]), _joined([one.bootstrap for one in draws])
+        *(
+            ScoreDraws(
+                np.concatenate([one.real for one in kind], axis=1),
+                np.concatenate([one.imagined for one in kind], axis=1),
+            )
+            for kind in ([one.posterior for one in draws], [one.bootstrap for one in draws])
+        )
     )
     without = {
         name: _value("pearson", np.delete(real, row, axis=1), np.delete(imagined, row, axis=1))
@@ -136,13 +131,6 @@ def pooled_agreement(
     }
     chance = chance_of_correlation(list(real), list(imagined), generator)
     return Agreement(_figures(real, imagined, joined), without, chance)
-
-
-def _joined(draws: Sequence[ScoreDraws]) -> ScoreDraws:
-    return ScoreDraws(
-        np.concatenate([one.real for one in draws], axis=1),
-        np.concatenate([one.imagined for one in draws], axis=1),
-    )
 
 
 def _value(name: str, real: np.ndarray, imagined: np.ndarray) -> float:
@@ -153,7 +141,6 @@ def _value(name: str, real: np.ndarray, imagined: np.ndarray) -> float:
 
 
 def _figures(real: np.ndarray, imagined: np.ndarray, draws: Draws) -> dict[str, Figure]:
-    """Figures of scores [tasks, policies] with their intervals."""
     posterior, bootstrap = figures_of_draws(draws.posterior), figures_of_draws(draws.bootstrap)
     num_policies, found = real.shape[1], {}
     for name in FIGURES:
@@ -234,11 +221,9 @@ def paired_differences(
 ) -> list[Difference]:
     """Differences of mean scores of all pairs of policies over matched starts.
 
-    A score that is NaN is missing: a pair is compared over the starts that both have, and left out
-    if there are none.
-
-    The interval is that of Bonett and Price (2012) for paired rates, which adds one difference of
-    +1 and one of −1; for graded scores in 0 … 1 the same two are added.
+    A pair is compared over the starts that both have a score of, which is not NaN. The interval is
+    that of Bonett and Price (2012) for paired rates, which adds one difference of +1 and one of −1;
+    for graded scores in 0 … 1 the same two are added.
     """
     found = []
     for first, second in itertools.combinations(range(len(policies)), 2):

@@ -12,12 +12,9 @@ DEFAULT_POLICY = PRETRAINED / "behaviour_cloning.safetensors"
 
 @dataclass(frozen=True)
 class Bundled:
-    """A bundled policy.
+    """A policy by MODULE:FACTORY, called with its checkpoint if it has one.
 
-    Attributes:
-        factory: MODULE:FACTORY, imported when it is used; called with the checkpoint if there is
-            one, otherwise without arguments.
-        checkpoint: file of its weights; a user may give another.
+    It is imported when it is used. Users may give another checkpoint.
     """
 
     factory: str
@@ -52,10 +49,7 @@ def checkpoint_of(name: str, given: Path | None = None) -> Path | None:
 
 
 def bundled_policy(name: str, checkpoint: Path | None = None) -> "Policy":
-    """Create a bundled policy, with other weights if they are given.
-
-    Raises NotFoundError or CorruptDataError for a checkpoint that cannot be read.
-    """
+    """Create a bundled policy, with other weights if they are given (`load_checkpoint`)."""
     make = _imported(BUNDLED[name].factory)
     path = checkpoint_of(name, checkpoint)
     made: Policy = make() if path is None else make(path)
@@ -63,10 +57,7 @@ def bundled_policy(name: str, checkpoint: Path | None = None) -> "Policy":
 
 
 def trained_policy(path: Path) -> "Policy":
-    """Load a policy of `dextouch train policy`, of any kind.
-
-    Raises NotFoundError, CorruptDataError or InvalidInputError for a file that is no such policy.
-    """
+    """Load a policy of `dextouch train policy`, of any kind; raises as `load_checkpoint`."""
     from services.evaluation.trained_networks import load_checkpoint
 
     checkpoint = load_checkpoint(path, kind=tuple(TRAINED))

@@ -1,9 +1,4 @@
-"""Calibration of a success classifier, and its metrics on endings that it was not trained on.
-
-Temperature and bias for each task and kind of ending map log odds to probabilities that match
-frequencies; they are fitted together with the band of probabilities in which the classifier should
-abstain.
-"""
+"""Calibration of a success classifier, and its metrics on endings that it was not trained on."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -41,15 +36,16 @@ _PRIOR_ENDINGS: Final = 2.0
 MIN_OUTCOMES: Final = 5
 # Milestones with a lower area under the ROC curve are not reported by the probe.
 MIN_MILESTONE_AUC: Final = 0.9
+# Kind of true endings that are given poses and touch, but no image.
+POSES: Final = "poses"
 Figures = dict[str, float | int]
 
 
 def expected_calibration_error(probabilities: np.ndarray, success: np.ndarray) -> float:
     """Mean distance of predicted and true success rates over bins of equal width (Guo et al. 2017).
 
-    Bins are weighted by their number of endings. Even a perfectly calibrated classifier has an
-    error of about √(p(1−p)/n) in a bin of n. Raises InvalidInputError without endings, or for
-    arrays of different lengths.
+    Bins are weighted by their number of endings; even a perfectly calibrated classifier has an
+    error of about √(p(1−p)/n) in a bin of n.
     """
     predicted, outcomes = _pair(probabilities, success)
     bins = np.minimum((predicted * NUM_BINS).astype(int), NUM_BINS - 1)
@@ -58,10 +54,7 @@ def expected_calibration_error(probabilities: np.ndarray, success: np.ndarray) -
 
 
 def brier(probabilities: np.ndarray, success: np.ndarray) -> float:
-    """Mean squared difference of probability and outcome (Brier 1950).
-
-    Raises InvalidInputError without endings, or for arrays of different lengths.
-    """
+    """Mean squared difference of probability and outcome (Brier 1950)."""
     predicted, outcomes = _pair(probabilities, success)
     return float(np.mean((predicted - outcomes) ** 2))
 
@@ -108,9 +101,7 @@ def fit_combination(
     decided, twice the risk is allowed; where no band keeps that, nothing is decided.
 
     `probe` [n] are calibrated probabilities of the classifier, `world` [n] the world's own, and
-    `success` [n] the outcomes; `risk` is the allowed share of errors among the decided endings, and
-    `margin` that of `Combination`. Raises InvalidInputError without endings, or for arrays of
-    different lengths.
+    `success` [n] the outcomes; `risk` is the allowed share of errors among the decided endings.
     """
     of_probe, outcomes = _pair(probe, success)
     estimated, _ = _pair(world, success)
@@ -280,7 +271,7 @@ def held_out_figures(probe: SuccessClassifier, episodes: Sequence[EndingEpisode]
         figures[f"num_held_out_successes_{task}"] = int(success.sum())
         figures[f"num_held_out_failures_{task}"] = int((~success).sum())
         for kind, (others, outcomes) in {
-            "poses": _with_poses_only(episodes, task),
+            "poses": final_endings(episodes, task, POSES),
             "imagined": final_endings(episodes, task, IMAGINED),
         }.items():
             if min(outcomes.sum(), (~outcomes).sum()) >= MIN_OUTCOMES:
@@ -315,32 +306,25 @@ def _figures(
 def final_endings(
     episodes: Sequence[EndingEpisode], task: str, kind: str
 ) -> tuple[list[Ending], Bool[np.ndarray, " n"]]:
-    """Final endings of a task, true or imagined, as a probe gets them, and their outcomes."""
-    mine = [e for e in _seen(episodes, task) if e.imagined == (kind == IMAGINED)]
-    success = np.array([e.success for e in mine], dtype=bool)
-    return [_as_seen(e.final) for e in mine], success
+    """Final endings of a task as a probe gets them, and their outcomes.
+
+    `kind` is true or imagined, or true ones with poses and touch but no image.
+    """
+    if kind == POSES:
+        known = [e for e in episodes if e.task == task and e.final.object_poses is not None]
+        mine = [e for e in known if not e.imagined]
+        endings = [replace(e.final, images=None) for e in mine]
+    else:
+        mine = [e for e in _seen(episodes, task) if e.imagined == (kind == IMAGINED)]
+        endings = [_as_seen(e.final) for e in mine]
+    return endings, np.array([e.success for e in mine], dtype=bool)
 
 
 def _seen(episodes: Sequence[EndingEpisode], task: str) -> list[EndingEpisode]:
-    """Those of a task whose final ending a probe can be given.
-
-    True endings are seen without poses of objects, so that nothing is left of those without images.
-    """
+    """Those of a task whose ending a probe sees: true ones without poses, so they need images."""
     mine = [e for e in episodes if e.task == task]
     return [e for e in mine if e.imagined or e.final.images is not None]
 
 
 def _as_seen(ending: Ending) -> Ending:
     return ending if ending.imagined else replace(ending, object_poses=None)
-
-
-def _with_poses_only(
-    episodes: Sequence[EndingEpisode], task: str
-) -> tuple[list[Ending], Bool[np.ndarray, " n"]]:
-    mine = [
-        e
-        for e in episodes
-        if e.task == task and not e.imagined and e.final.object_poses is not None
-    ]
-    success = np.array([e.success for e in mine], dtype=bool)
-    return [replace(e.final, images=None) for e in mine], success

@@ -1,22 +1,20 @@
 """Closed-loop evaluation: rolls out policies in worlds from matched starts and scores them.
 
-The real world starts each (task, seed) once for every policy; every imagined world starts from
-exactly that first observation, anchor and camera. Real success is reported by the real world,
-imagined success is the probe's decision on the last three steps. A failed rollout is recorded as a
-failure, and the others continue.
+Imagined worlds start from exactly the first observation, anchor and camera of the real one. Real
+success is reported by the real world, imagined success is the probe's decision on the ending.
 """
 
 import itertools
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float64
 
-from dextouch.clients import Policy, Rollout
+from dextouch.clients import Policy, PolicyStart, Rollout
 from dextouch.errors import ConflictError, DexTouchError, InvalidInputError, StorageError
 from dextouch.schemas import (
     MAX_SEED,
@@ -27,6 +25,7 @@ from dextouch.schemas import (
     rollout_uncertainty,
 )
 from dextouch.streams import HEAD_CAMERA
+from dextouch.tactile.layout import DEXTOUCH_V1, TactileLayout
 from dextouch.tracing import current_trace_id, in_trace
 from services.evaluation.endings import NUM_SEEN_STEPS, Ending
 from services.evaluation.matched_starts import (
@@ -42,11 +41,13 @@ from services.evaluation.matched_starts import (
 from services.evaluation.policies.outside import action_chunk, ask
 from services.evaluation.progress import Progress
 from services.evaluation.rating.marks import Rubric, read_rubrics
+from services.evaluation.reporting.pictures import PredictionPicture
 from services.evaluation.scores import REAL, ClosedLoopReport, Outcome, RolloutFailure, RolloutScore
 from services.evaluation.success_classifier import SuccessClassifier
 
 # Repeats of an imagined rollout differ by this in the seed of their noise.
 _REPEAT_STRIDE = 2**40
+Pair = tuple[RolloutScore, RolloutScore]
 
 
 @dataclass(frozen=True)
@@ -73,11 +74,9 @@ def evaluate(
     probe: SuccessClassifier,
     keep: Callable[[Outcome], None] | None = None,
 ) -> ClosedLoopReport:
-    """Roll out every policy from every start in every world.
+    """Roll out every policy from every start in every world, by their names in the report.
 
-    The real world reports success itself; imagined worlds, of which there may be none, and policies
-    are given by their names in the report. `keep` is called with every outcome as soon as it is
-    known.
+    There may be no imagined world. `keep` is called with every outcome as soon as it is known.
 
     Raises:
         ConflictError: a start was trained on.
@@ -146,11 +145,6 @@ class PlayedRollout:
     milestones: Mapping[str, float] = field(default_factory=dict)
 
     @property
-    def ending(self) -> Observation:
-        """The observation of the last chunk."""
-        return self.observations[-1]
-
-    @property
     def uncertainty(self) -> RolloutUncertainty:
         """The world's uncertainty of the whole rollout."""
         return rollout_uncertainty(self.observations)
@@ -189,8 +183,9 @@ class RolloutRunner:
         try:
             with in_trace():
                 played = self._play(start, actor, policy, world, repeat)
+            last = played.observations[-1]
             ending = Ending.of(
-                played.ending, start.task, imagined=world != REAL, uncertainty=played.uncertainty
+                last, start.task, imagined=world != REAL, uncertainty=played.uncertainty
             )
             verdict = self.own_probes.get(world, self.probe).verdict(ending)
         except DexTouchError as error:
@@ -213,10 +208,6 @@ class RolloutRunner:
         return score, played
 
     def _begin(self, start: MatchedStart, policy: str, world: str, repeat: int) -> Rollout:
-        """Start a rollout from a matched start (by task and seed in the real world).
-
-        Raises ConflictError if the real world started differently than before.
-        """
         address = self.worlds.addresses[world]
         client = address.client.selecting(ReturnSelector(cameras=self.worlds.cameras), name=policy)
         is_real = world == REAL
@@ -239,7 +230,6 @@ class RolloutRunner:
     def _play(
         self, start: MatchedStart, actor: Policy, policy: str, world: str, repeat: int
     ) -> PlayedRollout:
-        """Run a policy in a rollout."""
         description = self.worlds.descriptions[world]
         where = f"policy {policy!r}, task {start.task!r}, seed {start.seed}"
         with self._begin(start, policy, world, repeat) as rollout:
@@ -247,7 +237,8 @@ class RolloutRunner:
             commanded = [rollout.observation.action_reached[-1:]]
             milestones: dict[str, float] = {}
             # The world's images may be smaller than that of the start.
-            given = replace(start.for_policy(), K_head=rollout.K_head)
+            K_head = rollout.K_head
+            given = PolicyStart(start.task, start.instruction, start.seed, start.anchor, K_head)
             ask(actor.reset, given, where=f"{where}: reset")
             while (left := self.num_steps - rollout.info.last_step) > 0:
                 acting = f"{where}, chunk {rollout.info.next_chunk}: act"
@@ -275,11 +266,7 @@ class RolloutRunner:
     def _step(
         self, rollout: Rollout, chunk: np.ndarray, left: int, *, images: bool | str, multiple: int
     ) -> Iterator[Observation]:
-        """Advance by a chunk; images, which take most of the time, only where they are needed.
-
-        `left` is the number of steps to the end of the rollout, including this chunk, `images` the
-        policy's `uses_images` (`dextouch.clients.Policy`), `multiple` the world's chunk multiple.
-        """
+        """Advance by a chunk; images, which take most of the time, only where they are needed."""
         cameras, is_last = self.worlds.cameras, len(chunk) == left
         if self.shows_all or images is True or (images and is_last):
             selector = ReturnSelector(cameras=cameras if images else (HEAD_CAMERA,))
@@ -300,12 +287,9 @@ class RolloutRunner:
 
 
 class ResultLog:
-    """Appends rollouts one by one, so that an interrupted study keeps its results.
+    """Appends rollouts one by one to a file, so that an interrupted study keeps its results.
 
     Rows of earlier studies are kept and distinguished by `study`, the start time of the study.
-
-    Args:
-        path: file to append to; it and its folder are created with the first row.
     """
 
     def __init__(self, path: Path) -> None:
@@ -323,3 +307,80 @@ class ResultLog:
             raise StorageError(
                 f"results {self.path}: cannot be written ({error}); choose another --results"
             ) from error
+
+
+def film(
+    report: ClosedLoopReport,
+    *,
+    real: WorldAddress,
+    imagined: Mapping[str, WorldAddress],
+    policies: Mapping[str, Policy],
+    plan: EvaluationPlan,
+    probe: SuccessClassifier,
+) -> tuple[PredictionPicture, ...]:
+    """Play the example pair of every task again, with the images of all steps.
+
+    The evaluation renders only what policies and the success classifier use. The arguments are
+    those of `evaluate`, and `report` what it returned; a pair that fails now is left out, and a
+    robot is not moved for a picture.
+    """
+    if not imagined:
+        return ()
+    world = report.imagined_worlds[0]
+    worlds = StudyWorlds.ask(real, {world: imagined[world]})
+    if worlds.descriptions[REAL].kind == "robot":
+        return ()
+    runner = RolloutRunner(worlds, probe, plan.num_steps, shows_all=True)
+    found = []
+    for task, pair in example_pairs(report, world).items():
+        name, instruction = pair[0].policy, plan.instructions[task]
+        start = matched_start(real, task, pair[0].seed, instruction)
+        played = [runner.run(start, policies[name], name, one)[1] for one in (REAL, world)]
+        finished = [one for one in played if one is not None]
+        if len(finished) == 2:
+            description = worlds.descriptions[REAL]
+            layout = TactileLayout.of(description.tactile_layout) or DEXTOUCH_V1
+            found.append(_played_pair(pair, finished, description.model_rate_hz, layout))
+    return tuple(found)
+
+
+def example_pairs(report: ClosedLoopReport, world: str) -> dict[str, Pair]:
+    """By task the first start and policy whose outcomes differ, or else succeed in both worlds."""
+    known = {(s.world, s.task, s.policy, s.seed): s for s in report.scores if s.repeat == 0}
+    found: dict[str, Pair] = {}
+    for (where, task, policy, seed), score in known.items():
+        imagined = known.get((world, task, policy, seed))
+        if where != REAL or imagined is None:
+            continue
+        pair = (score, imagined)
+        if task not in found or _rank(pair) > _rank(found[task]):
+            found[task] = pair
+    return found
+
+
+def _rank(pair: Pair) -> tuple[bool, bool]:
+    return pair[0].success != pair[1].success, pair[0].success
+
+
+def title_of(pair: Pair) -> str:
+    """Task, policy, start and both outcomes."""
+    real, imagined = ("success" if one.success else "failure" for one in pair)
+    task = pair[0].task.replace("_", " ")
+    return f"{task}, {pair[0].policy}, start {pair[0].seed}: {real} in fact, {imagined} imagined"
+
+
+def _played_pair(
+    pair: Pair, played: list[PlayedRollout], rate_hz: float, layout: TactileLayout
+) -> PredictionPicture:
+    images = [np.concatenate([o.images[HEAD_CAMERA] for o in one.observations]) for one in played]
+    touch = [np.concatenate([o.tactile_kpa for o in one.observations]) for one in played]
+    steps = min(map(len, images))
+    return PredictionPicture(
+        title_of(pair),
+        np.arange(steps) / rate_hz,
+        images[0][:steps],
+        images[1][:steps],
+        touch[0][:steps],
+        touch[1][:steps],
+        layout,
+    )

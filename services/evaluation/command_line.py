@@ -14,15 +14,15 @@ from dextouch.errors import InvalidInputError, UnknownNameError
 from dextouch.free_text import printable
 from dextouch.serving import load_settings
 from services.evaluation.bundled_policies import bundled_policy, training_starts_of
-from services.evaluation.closed_loop import EvaluationPlan, ResultLog, evaluate
+from services.evaluation.closed_loop import EvaluationPlan, ResultLog, evaluate, film
 from services.evaluation.endings import EndingEpisode, read_ending_episodes
-from services.evaluation.filmed_pairs import film
 from services.evaluation.matched_starts import WorldAddress
 from services.evaluation.policies.cloning_training import read_cloning_episodes, train_cloned_policy
 from services.evaluation.policies.outside import load_policies
 from services.evaluation.policies.replay import ReplayPolicy
-from services.evaluation.reporting import ReportPictures, write_report
-from services.evaluation.reporting.sections import failure_rows, figure, undecided_note
+from services.evaluation.reporting import write_report
+from services.evaluation.reporting.pictures import ReportPictures
+from services.evaluation.reporting.sections import failure_rows, undecided_note
 from services.evaluation.settings import (
     DEFAULT_PROBE,
     PACKAGE,
@@ -37,6 +37,7 @@ from services.evaluation.success_classifier_training import (
     calibrate_success_classifier,
     train_success_classifier,
 )
+from services.evaluation.templates import rendered
 from services.evaluation.trained_networks import Checkpoint, load_checkpoint, save_checkpoint
 
 EXIT_FAILED = 1
@@ -61,7 +62,7 @@ def run_train_policy(arguments: list[str]) -> int:
         early_at=settings.early_at,
     )
     if early is not None:
-        keep(early, settings.early_output(), None)
+        keep(early, settings.output.with_stem(f"{settings.output.stem}_early"), None)
     return keep(finished, settings.output, settings.json_path)
 
 
@@ -148,12 +149,7 @@ def run_evaluation(arguments: list[str]) -> int:
 
 
 def gather_policies(settings: RunSettings) -> tuple[dict[str, Policy], dict[str, Sequence[str]]]:
-    """All requested policies by name, and the training starts of the bundled ones.
-
-    Raises:
-        InvalidInputError: two policies of one name, or a user policy that does not load.
-        UnknownNameError: arguments for a policy that was not requested.
-    """
+    """All requested policies by name, and the training starts of bundled ones; `load_policies`."""
     policies = load_policies(
         settings.policy,
         settings.policy_arguments,
@@ -193,39 +189,7 @@ def opened(world: ServedWorld, connections: ExitStack) -> WorldAddress:
 
 def print_scores(report: Mapping[str, Any]) -> None:
     """Print success rates, of how many decided rollouts, and agreement of a report."""
-    worlds = ["real"] if report["imagined_world"] is None else ["real", "imagined"]
-    print(f"{'task':<16}{'policy':<22}" + "".join(f"{world:>16}" for world in worlds))
-    for row in report["policies"]:
-        rates = "".join(
-            f"{figure(row[world])} of {_num_decided(row, world)}".rjust(16) for world in worlds
-        )
-        note = undecided_note(row, worlds[-1])
-        print(f"{row['task']:<16}{row['policy']:<22}{rates}{f'  {note}' if note else ''}")
-    for task, rows in report["real_differences"].items() if not report["agreement"] else ():
-        print(f"\n{task}: differences of success rates")
-        for row in rows:
-            pair, (low, high) = f"{row['first']} - {row['second']}", row["interval"]
-            interval = f"({low:+.2f} … {high:+.2f})"
-            print(f"  {pair}: {row['difference']:+.2f} {interval}, p {figure(row['p'])}")
-    for task, figures in report["agreement"].items():
-        error = figure(figures.get("mean_absolute_error"))
-        print(
-            f"\n{task}: Pearson {figure(figures['pearson'])}{_interval(figures, 'pearson')}, MMRV "
-            f"{figure(figures['mmrv'])} with ties counted, {figure(figures['mmrv_paper'])} by the "
-            f"paper's rule; mean absolute error of the success rates {error}"
-            f"{_interval(figures, 'mean_absolute_error')}"
-        )
-        for comment in report["comments"][task]:
-            print(f"  {comment}")
-
-
-def _num_decided(row: Mapping[str, Any], world: str) -> int:
-    return int(row[f"{world}_rollouts"] - row.get(f"{world}_undecided", 0))
-
-
-def _interval(figures: Mapping[str, Any], name: str) -> str:
-    interval = figures.get(f"{name}_interval")
-    return f" (95 % {interval[0]:.2f} … {interval[1]:.2f})" if isinstance(interval, list) else ""
+    print(rendered("scores.txt.j2", report=report, undecided_note=undecided_note), end="")
 
 
 def print_failures(report: Mapping[str, Any], results: Path) -> None:

@@ -249,11 +249,9 @@ def read_ending_episodes(
     splits: Collection[Split] = (),
     image_px: int = USUAL_IMAGE_PX,
 ) -> list[EndingEpisode]:
-    """Read the robot episodes of some stores that can be judged, with their endings.
+    """Read true and imagined robot episodes of some stores that can be judged, with their endings.
 
-    True and imagined episodes may be mixed. `tasks` and `splits` of scenes are empty for all; the
-    middle square of larger images is scaled to `image_px`. Raises NotFoundError and ConflictError
-    as `select_episodes`.
+    Raises as `select_episodes` and `read_ending_episode`.
     """
     readers = select_episodes(
         stores, domain="robot", tasks=tasks, splits=splits, origins=(), needs=JUDGED
@@ -279,14 +277,10 @@ def milestones_of(episodes: Iterable[EndingEpisode]) -> dict[str, tuple[str, ...
 
 
 def pad_features(tactile_kpa: np.ndarray) -> Float32[np.ndarray, "*batch 24"]:
-    """Mean and maximum of √kPa / 4 per hand and pad: where the hand touches, and how hard.
+    """Mean and maximum of √kPa / 4 per hand and pad of pressures [..., 2, 320] of `dextouch_v1`.
 
-    Args:
-        tactile_kpa: [..., 2, 320] of `dextouch_v1`; small negative readings count as zero.
-
-    Raises:
-        ShapeError: not [..., 2, 320], such as touch of another glove.
-        NonFiniteError: NaN or infinity.
+    Small negative readings count as zero. Raises ShapeError for another shape, such as touch of
+    another glove, and NonFiniteError for NaN or infinity.
     """
     taxels = np.asarray(tactile_kpa, dtype=np.float32)
     layout = DEXTOUCH_V1
@@ -303,14 +297,10 @@ def pad_features(tactile_kpa: np.ndarray) -> Float32[np.ndarray, "*batch 24"]:
 
 
 def object_features(object_poses: np.ndarray) -> Float32[np.ndarray, "105"]:
-    """Features of the poses at the last steps; an absent object and its pairs give zeros.
+    """Features of the poses T_world_object [steps, objects ≤ 3, 7] (x y z m, qw qx qy qz).
 
-    Args:
-        object_poses: T_world_object [steps, objects ≤ 3, 7] (x y z m, qw qx qy qz), the last step
-            being the current one. An object with a non-finite number or a zero quaternion counts as
-            absent.
-
-    Raises ShapeError for other shapes, or more objects.
+    The last step is the current one. An object with a non-finite number or a zero quaternion counts
+    as absent; it and its pairs give zeros. Raises ShapeError for other shapes, or more objects.
     """
     poses = np.asarray(object_poses, dtype=np.float64)
     if poses.ndim != 3 or poses.shape[2] != 7 or not 0 < poses.shape[1] <= MAX_OBJECTS:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-from dextouch.clients import PolicyStart, RolloutClient
+from dextouch.clients import RolloutClient
 from dextouch.errors import ConflictError, DexTouchError, InvalidInputError, UnknownNameError
 from dextouch.hands.actions import AnchorPoses
 from dextouch.schemas import ActionKind, Observation, WorldDescription
@@ -35,10 +35,8 @@ class StudyWorlds:
     def ask(cls, real: WorldAddress, imagined: Mapping[str, WorldAddress]) -> "StudyWorlds":
         """Request the description of every world from its service.
 
-        Raises:
-            UnavailableError: a service does not answer.
-            UnknownNameError: a service has no world of this name.
-            InvalidInputError: an imagined world has the name of the real one.
+        Raises UnavailableError if one does not answer, UnknownNameError if it has no world of this
+        name, and InvalidInputError if an imagined world has the name of the real one.
         """
         if REAL in imagined:
             raise InvalidInputError(
@@ -64,12 +62,9 @@ class StudyWorlds:
     def check(self, tasks: Sequence[str], num_steps: int, image_size_px: int) -> None:
         """Reject incompatible worlds before the first rollout.
 
-        Raises:
-            UnknownNameError: a task that a world does not have.
-            InvalidInputError: a real world that does not report success or does not start from
-                task and seed, an imagined one that does not start from its observations, touch of
-                a glove that success classifiers do not support, images of another size than
-                theirs, or a length that is not a multiple of a world's chunk.
+        Raises UnknownNameError for a task that a world does not have, and InvalidInputError for
+        worlds that cannot report or start what is needed, or for images, touch or a length of
+        rollouts that do not fit success classifiers or a world's chunk.
         """
         real = self.descriptions[REAL]
         if not real.knows_success or "task_seed" not in real.starts_from:
@@ -188,10 +183,6 @@ class MatchedStart:
     def digest(self) -> str:
         """Digest of image and touch."""
         return first_digest(self.observation)
-
-    def for_policy(self) -> PolicyStart:
-        """Information given to a policy before it acts."""
-        return PolicyStart(self.task, self.instruction, self.seed, self.anchor, self.K_head)
 
 
 @dataclass(frozen=True)

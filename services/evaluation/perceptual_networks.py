@@ -1,8 +1,4 @@
-"""Metrics with pretrained networks, read from local safetensors files: LPIPS, CLIP and DINO.
-
-Nothing is ever downloaded. A folder of weights has a subfolder for each network; see
-docs/evaluation.md for their contents.
-"""
+"""Metrics with pretrained networks of local files: LPIPS, CLIP, DINO (docs/evaluation.md)."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -70,9 +66,8 @@ class Metric:
 class Lpips(nn.Module):
     """Learned perceptual image patch similarity with AlexNet (Zhang et al. 2018): 0 for equals.
 
-    Args:
-        folder: with `alexnet.safetensors` (names of torchvision: features.0.weight, …) and
-            `heads.safetensors` (names of the package lpips: lin0.model.1.weight, …).
+    The folder has `alexnet.safetensors` (names of torchvision: features.0.weight, …) and
+    `heads.safetensors` (names of the package lpips: lin0.model.1.weight, …).
     """
 
     def __init__(self, folder: Path) -> None:
@@ -121,12 +116,7 @@ class Lpips(nn.Module):
 
 
 class PerceptualNetworks:
-    """Networks in a folder of weights, each read when it is first used.
-
-    Args:
-        folder: with the subfolders `lpips`, `clip`, `aesthetic` and `dino`, of which any may be
-            missing.
-    """
+    """Networks in subfolders `lpips`, `clip`, `aesthetic` and `dino`, each read when first used."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder

@@ -1,8 +1,4 @@
-"""Prediction errors of a world on held-out episodes, beside simple baselines.
-
-Only the `World` interface is used, so that all kinds of world models are measured in the same way:
-over windows of one chunk, or over whole open-loop rollouts.
-"""
+"""Prediction errors of any world on held-out episodes, beside simple baselines."""
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -25,17 +21,17 @@ from services.evaluation.prediction_scenes import (
     Future,
     Scene,
     copied,
-    geometry_error,
+    depth_errors,
     imagine,
     other_instruction,
     other_take,
     reconstructed,
     standing_still,
-    trajectory_accuracy,
+    trajectory_accuracies,
     warped,
 )
 from services.evaluation.progress import Progress
-from services.evaluation.reporting import PredictionPicture
+from services.evaluation.reporting.pictures import PredictionPicture
 
 MODEL: Final = "model"
 ALL_TASKS: Final = "all"
@@ -65,11 +61,15 @@ def _of_touch(function: Callable[..., float], pairs: Pairs) -> float:
     )
 
 
-def _of_geometry(function: Callable[..., float], pairs: Pairs) -> float:
-    """Over the scenes whose true geometry is known."""
-    return function(
-        [(one.geometry, future.images) for one, future in pairs if one.geometry is not None]
-    )
+def _of_geometry(function: Callable[..., list[float]], pairs: Pairs) -> float:
+    """Mean over the scenes whose true geometry is known, and over what moves; NaN if nothing is."""
+    found = [
+        value
+        for scene, future in pairs
+        if scene.geometry is not None
+        for value in function(scene.geometry, future.images)
+    ]
+    return float(np.mean(found)) if found else float("nan")
 
 
 def _object_error(pairs: Pairs) -> float:
@@ -93,11 +93,11 @@ METRICS: Final = {metric.name: metric for metric in (
     Metric("ssim", "SSIM", "", "higher", "images", partial(_of_images, image_metrics.ssim),
            "structural similarity, Gaussian window of 11 px, mean over images; 1 for equal ones"),
     Metric("trajectory_accuracy", "Trajectory Accuracy", "", "higher", "geometry",
-           partial(_of_geometry, trajectory_accuracy),
+           partial(_of_geometry, trajectory_accuracies),
            "nDTW of the hands and objects that move by 2 px or more, found by their colours, with "
            "a tolerance of 5 % of the image's width; 1 for equal trajectories"),
     Metric("geometry_error", "Geometry Error", "", "lower", "geometry",
-           partial(_of_geometry, geometry_error),
+           partial(_of_geometry, depth_errors),
            "AbsRel of the depth of what each pixel shows, found by colour, after alignment of the "
            "scale"),
     Metric("tactile_psnr", "PSNR of taxels", "dB", "higher", "touch",

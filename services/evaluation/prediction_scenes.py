@@ -1,6 +1,6 @@
 """Recorded futures that predictions of a world are compared with, their geometry, and baselines."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -117,25 +117,10 @@ def implied_depth(
     return depth_m
 
 
-def trajectory_accuracy(
-    pairs: Iterable[tuple[SceneGeometry, UInt8[np.ndarray, "shown h w 3"]]],
-) -> float:
-    """Mean over scenes and moving bodies; NaN if none moves."""
-    found = [value for pair in pairs for value in trajectory_accuracies(*pair)]
-    return float(np.mean(found)) if found else float("nan")
-
-
-def geometry_error(
-    pairs: Iterable[tuple[SceneGeometry, UInt8[np.ndarray, "shown h w 3"]]],
-) -> float:
-    """AbsRel of the implied depth where the truth shows something, mean over scenes."""
-    found = [
-        depth_metrics.depth_error(
-            predicted_m=implied_depth(geometry, images), true_m=geometry.depth_m
-        )
-        for geometry, images in pairs
-    ]
-    return float(np.mean(found)) if found else float("nan")
+def depth_errors(geometry: SceneGeometry, images: UInt8[np.ndarray, "shown h w 3"]) -> list[float]:
+    """AbsRel of the implied depth where the truth shows something, of the whole scene."""
+    implied_m = implied_depth(geometry, images)
+    return [depth_metrics.depth_error(predicted_m=implied_m, true_m=geometry.depth_m)]
 
 
 @dataclass(frozen=True)
@@ -195,9 +180,7 @@ class Scene:
 def read_rollout(reader: EpisodeReader) -> Scene:
     """A whole episode as one scene, up to its last complete chunk.
 
-    Raises:
-        InvalidInputError: an episode shorter than one chunk.
-        UnknownNameError: no head camera.
+    Raises InvalidInputError if it is shorter than one, UnknownNameError without head camera.
     """
     num_steps = (reader.num_steps - 1) // CHUNK_STEPS * CHUNK_STEPS
     if num_steps == 0:

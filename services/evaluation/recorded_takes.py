@@ -1,8 +1,6 @@
 """Policies scored in a world model from the first observations of recorded takes.
 
-A lab without a simulation has takes of its robot, with outcomes that operators entered. Replayed in
-the world model, their actions show how far its verdicts can be trusted; policies that act from the
-same first observations are scored by the same judge.
+The takes' own actions, replayed there, show how far its verdicts can be trusted.
 """
 
 from collections import Counter
@@ -37,9 +35,10 @@ from services.evaluation.matched_starts import (
 )
 from services.evaluation.policies.replay import ReplayPolicy
 from services.evaluation.progress import Progress
-from services.evaluation.scores import Outcome, RolloutFailure, RolloutScore
-from services.evaluation.statistics import area_under_roc, central_interval, wilson_interval
+from services.evaluation.scores import ClosedLoopReport, Outcome, RolloutFailure, RolloutScore
+from services.evaluation.statistics import area_under_roc, central_interval
 from services.evaluation.success_classifier import SuccessClassifier
+from services.evaluation.templates import rendered
 from services.networks.training_settings import USUAL_IMAGE_PX
 
 IMAGINED: Final = "imagined"
@@ -150,19 +149,12 @@ class RecordedScores:
 
     def policy_row(self, policy: str, task: str) -> dict[str, Any]:
         """Imagined success of a policy among its decided rollouts, with its Wilson interval."""
-        scores = self.scores(policy, task)
-        decided = [one for one in scores if one.cannot_tell is None]
-        row: dict[str, Any] = {
-            "policy": policy,
-            "task": task,
-            "rollouts": len(scores),
-            "decided": len(decided),
-        }
-        if decided:
-            successes = sum(one.success for one in decided)
-            interval = wilson_interval(successes, len(decided))
-            row["imagined"] = successes / len(decided)
-            row["imagined_interval"] = [interval.low, interval.high]
+        scores = tuple(self.scores(policy, task))
+        found = ClosedLoopReport(scores, (IMAGINED,), (policy,)).figures(IMAGINED, task, policy)
+        num_decided = len(scores) - found.get("undecided", 0)
+        row = {"policy": policy, "task": task, "rollouts": len(scores), "decided": num_decided}
+        if num_decided:
+            row |= {"imagined": found["rate"], "imagined_interval": found["interval"]}
         return row
 
     def to_report(self) -> dict[str, Any]:
@@ -191,13 +183,8 @@ def score_recorded(
 
     Rollouts last as long as their takes, whole chunks of the world; a failed one is recorded as a
     failure, and the others continue. `trained_on` maps trained components, beside the judge, to
-    digests of their training starts.
-
-    Raises:
-        ConflictError: a take was trained on.
-        InvalidInputError: a task that the world or the judge does not know, touch of a glove that
-            judges do not support, images of another size than the judge's, or a take that is
-            shorter than a chunk.
+    digests of their training starts. Raises ConflictError for a take that was trained on, and
+    InvalidInputError for a task, touch, images or a length that the world or the judge do not know.
     """
     digests = [digest for take in takes for digest in _digests(take.start)]
     judged = {"the success classifier": probe.metadata.training_starts}
@@ -241,10 +228,7 @@ def score_recorded(
 
 
 def _digests(start: MatchedStart) -> tuple[str, ...]:
-    """Digests of a start: as recorded, and as a world that saw it shows it, which may be imagined.
-
-    Such worlds scale the image and take no negative pressure.
-    """
+    """Digests of a start: as recorded, and with the image and touch that worlds make of it."""
     touch = start.observation.tactile_kpa[0]
     images = start.observation.images[HEAD_CAMERA]
     small = square_of_at_most(images, start.K_head, USUAL_IMAGE_PX)[0][0]
@@ -267,38 +251,4 @@ def _auc_interval(probability: np.ndarray, real: np.ndarray) -> list[float]:
 
 def score_lines(scores: RecordedScores) -> list[str]:
     """The result as text: first how far to trust it, then the policies."""
-    lines = [
-        "How far to trust it: recorded actions, judged in imagination, against their outcomes",
-        f"{'task':<18}{'takes':>6}{'real':>7}{'imagined':>10}{'decided':>9}{'wrong':>7}"
-        "   AUC (95 %)",
-    ]
-    for task in scores.tasks:
-        found = scores.trust(task)
-        area = "   too few takes of one outcome"
-        if "auc" in found:
-            low, high = found["auc_interval"]
-            area = f"   {found['auc']:.2f} ({low:.2f} … {high:.2f})"
-        cells = (_share(found, "real", 7), _share(found, "imagined", 10))
-        decided = f"{found['decided']}".rjust(9)
-        lines.append(
-            f"{task:<18}{found['takes']:>6}{cells[0]}{cells[1]}{decided}"
-            f"{_share(found, 'wrong', 7)}{area}"
-        )
-    if scores.policies:
-        lines += ["", "Policies from the same first observations: imagined success (95 %)"]
-    for task in scores.tasks:
-        for policy in scores.policies:
-            row = scores.policy_row(policy, task)
-            rate = "cannot tell"
-            if "imagined" in row:
-                low, high = row["imagined_interval"]
-                rate = f"{row['imagined']:.2f} ({low:.2f} … {high:.2f})"
-            lines.append(
-                f"{task:<18}{policy:<24}{rate:<24}of {row['decided']} decided, "
-                f"{row['rollouts']} rollouts"
-            )
-    return lines
-
-
-def _share(found: Mapping[str, Any], name: str, width: int) -> str:
-    return (f"{found[name]:.2f}" if name in found else "-").rjust(width)
+    return rendered("recorded.txt.j2", report=scores.to_report()).splitlines()

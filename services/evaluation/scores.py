@@ -19,11 +19,11 @@ from services.evaluation.agreement import (
     task_agreement,
 )
 from services.evaluation.statistics import MatchedScores, known_mean, wilson_interval
+from services.evaluation.templates import UNDEFINED, rendered
 
 # Endings that should be decided where classifier and world are good enough.
 LEAST_DECIDED: Final = 0.60
 REAL = "real"
-UNDEFINED = "undefined"
 # Smaller mean differences of success are not mentioned.
 NOTABLE_BIAS = 0.05
 # Changes of a correlation by one policy below this are not mentioned.
@@ -142,7 +142,7 @@ class ClosedLoopReport:
     def policy_rows(self) -> list[dict[str, Any]]:
         """One row per policy and task: real and imagined success rate with Wilson intervals.
 
-        Shown by `report.html.j2`, `print_scores`, `latex_tables` and `study_figures`.
+        Shown by pages, tables and texts of templates, and by `policy_panels`.
         """
         rows = []
         for task in self.tasks:
@@ -151,40 +151,39 @@ class ClosedLoopReport:
                 for name, world in zip(
                     (REAL, "imagined"), (REAL, *self.imagined_worlds), strict=False
                 ):
-                    row |= self._cell(name, world, task, policy)
+                    row |= self._prefixed(name, world, task, policy)
                 row["other_worlds"] = {
-                    world: self._cell("success", world, task, policy)
+                    world: self._prefixed("success", world, task, policy)
                     for world in self.imagined_worlds[1:]
                 }
                 rows.append(row)
         return rows
 
-    def _cell(self, name: str, world: str, task: str, policy: str) -> dict[str, Any]:
+    def _prefixed(self, name: str, world: str, task: str, policy: str) -> dict[str, Any]:
+        figures = self.figures(world, task, policy)
+        return {name: figures.pop("rate")} | {f"{name}_{k}": one for k, one in figures.items()}
+
+    def figures(self, world: str, task: str, policy: str) -> dict[str, Any]:
+        """Success rate of a policy with its Wilson interval, and what it is of."""
         mine = [s for s in self._of(world, task) if s.policy == policy]
         num_failed = sum(f.policy == policy for f in self._failed(world, task))
-        counts: dict[str, Any] = {f"{name}_rollouts": len(mine), f"{name}_failed": num_failed}
+        found: dict[str, Any] = {"rate": UNDEFINED, "rollouts": len(mine), "failed": num_failed}
         if not mine:
-            return {name: UNDEFINED, f"{name}_probability": UNDEFINED, **counts}
-        counts |= {
-            f"{name}_probability": float(np.mean([s.probability for s in mine])),
-            f"{name}_undecided": len(mine) - len(_decided(mine)),
-            f"{name}_comparable": self._is_comparable(world, task, policy),
-        }
+            return found | {"probability": UNDEFINED}
+        found["probability"] = float(np.mean([s.probability for s in mine]))
+        found["undecided"] = len(mine) - len(_decided(mine))
+        found["comparable"] = self._is_comparable(world, task, policy)
+        if math.isfinite(rubric := self._rubric(world, task, policy)):
+            found["rubric"] = rubric
         # Repeats of one start are one observation of the policy.
         starts: dict[int, list[RolloutScore]] = {}
-        if math.isfinite(rubric := self._rubric(world, task, policy)):
-            counts[f"{name}_rubric"] = rubric
         for score in _decided(mine):
             starts.setdefault(score.seed, []).append(score)
-        if not starts:
-            return {name: UNDEFINED, **counts}
-        successes = sum(map(_success_share, starts.values()))
-        interval = wilson_interval(successes, len(starts))
-        return {
-            name: successes / len(starts),
-            f"{name}_interval": [interval.low, interval.high],
-            **counts,
-        }
+        if starts:
+            successes = sum(map(_success_share, starts.values()))
+            interval = wilson_interval(successes, len(starts))
+            found |= {"rate": successes / len(starts), "interval": [interval.low, interval.high]}
+        return found
 
     def _is_comparable(self, world: str, task: str, policy: str) -> bool:
         mine = [s for s in self._of(world, task) if s.policy == policy]
@@ -341,12 +340,7 @@ def matched(
 
     Excludes policies without a start that finished in both worlds, then starts that did not
     finish in both worlds for every remaining policy, then policies without a decided one of these.
-
-    Args:
-        policies: names, in the order of the outcomes.
-        real: outcomes in the real world.
-        imagined: outcomes in the imagined one, undecided ones with the likelier.
-        decided: the same with NaN for undecided ones, which is what is returned.
+    `imagined` has the likelier outcome of undecided rollouts, `decided` NaN.
     """
     known = np.isfinite(real) & np.isfinite(imagined)
     rows = known.any(axis=1)
@@ -357,7 +351,6 @@ def matched(
 
 
 def _entries(agreement: Agreement, num_policies: int) -> dict[str, Any]:
-    """Report entries of figures and intervals, correlations without one policy, and chance."""
     found: dict[str, Any] = {}
     for name, figure in agreement.figures.items():
         interval = figure.interval
@@ -386,144 +379,38 @@ def task_comments(
     rows: Sequence[Mapping[str, Any]], agreement: Mapping[str, Any], world: str
 ) -> list[str]:
     """Sentences about one task, from its rows of `policy_rows` and its figures of `agreement`."""
-    both = f"both worlds (real and {world})"
-    undecided = _undecided(rows, agreement["not_comparable"], world)
-    if agreement["num_starts"] == 0:
-        if len(agreement["not_comparable"]) == len(rows):
-            return [*undecided, "No policy is left to compare."]
-        nothing = f"No start was completed in {both} by every policy: nothing to compare."
-        return [*undecided, nothing]
-    undefined = []
-    if isinstance(agreement["pearson"], str):
-        undefined = [_why_undefined(list(agreement["rates"].values()), world)]
-    return [
-        *undecided,
-        _compared_starts(rows, agreement, both),
-        _size_of_a_step(rows),
-        _mean_error(agreement["bias"], world),
-        *_widest_gaps(rows, world),
-        *undefined,
-        *_correlation(agreement),
-    ]
-
-
-def _correlation(agreement: Mapping[str, Any]) -> list[str]:
-    """Interval and chance level of the correlation, and the policy that influences it most."""
-    interval, chance = agreement.get("pearson_interval"), agreement.get("pearson_chance")
-    if not isinstance(interval, list) or not isinstance(chance, float):
-        return []
-    low, high = interval
-    vague = "; too wide to tell a faithful world from a poor one" if low < VAGUE_R else ""
-    sentences = [
-        f"Between the policies' true success rates Pearson's r is {low:.2f} to {high:.2f} (95 %)"
-        f"{vague}. {_chance(chance)}"
-    ]
-    r, without = agreement["pearson"], agreement["pearson_without"]
-    moved = {name: value - r for name, value in without.items() if not isinstance(value, str)}
-    name = max(moved, key=lambda one: abs(moved[one]), default=None)
-    if name is not None and abs(moved[name]) >= NOTABLE_INFLUENCE:
-        sentences.append(f"Without {name!r}, r would be {without[name]:.2f} instead of {r:.2f}.")
-    return sentences
-
-
-def _chance(chance: float) -> str:
-    share = f"{chance:.2g}" if chance >= 0.001 else "fewer than one in a thousand"
-    return f"Share of all pairings of the policies' rates that correlate at least as well: {share}."
-
-
-def _undecided(
-    rows: Sequence[Mapping[str, Any]], not_comparable: Sequence[str], world: str
-) -> list[str]:
-    """How many rollouts are in no rate, and which policies are not compared because of that."""
-    undecided = sum(row.get("imagined_undecided", 0) for row in rows)
-    if not undecided:
-        return []
-    sentences = [
-        f"Of {undecided} of {sum(row['imagined_rollouts'] for row in rows)} rollouts in {world} it "
-        "cannot be told whether they succeeded; they count in no rate."
-    ]
-    if not_comparable:
-        sentences.append(
-            f"Not compared, because fewer than {LEAST_DECIDED:.0%} of the rollouts in {world} were "
-            f"decided: {', '.join(map(repr, not_comparable))}."
-        )
-    return sentences
-
-
-def _compared_starts(
-    rows: Sequence[Mapping[str, Any]], agreement: Mapping[str, Any], both: str
-) -> str:
-    named = {*agreement["rates"], *agreement["not_comparable"]}
-    left_out = [repr(row["policy"]) for row in rows if row["policy"] not in named]
-    unless = f" except {', '.join(left_out)}, which completed none" if left_out else ""
-    num_starts = rows[0]["real_rollouts"] + rows[0]["real_failed"]
-    return (
-        f"Agreement is computed over {agreement['num_starts']} of {num_starts} starts, those "
-        f"completed in {both} by every policy{unless}."
-    )
-
-
-def _size_of_a_step(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Contribution of one rollout to a rate, by the number of completed real rollouts."""
-    policies: dict[int, list[str]] = {}
-    for row in rows:
-        if row["real_rollouts"]:
-            policies.setdefault(row["real_rollouts"], []).append(repr(row["policy"]))
-    steps = [f"{1 / n:.2f} (N = {n}: {', '.join(names)})" for n, names in policies.items()]
-    if len(steps) == 1:
-        n = next(iter(policies))
-        steps = [f"{1 / n:.2f} (N = {n} for each policy)"]
-    return f"One rollout changes a real success rate by {' or '.join(steps)}."
-
-
-def _mean_error(bias: float, world: str) -> str:
-    start = "On these starts"
-    if bias >= NOTABLE_BIAS:
-        return (
-            f"{start} {world} is too optimistic: its success rates are {bias:.2f} above the "
-            "real ones on average."
-        )
-    if bias <= -NOTABLE_BIAS:
-        return (
-            f"{start} {world} is too pessimistic: its success rates are {-bias:.2f} below "
-            "the real ones on average."
-        )
-    return f"{start} the success rates of {world} are {bias:+.2f} from the real ones on average."
-
-
-def _widest_gaps(rows: Sequence[Mapping[str, Any]], world: str) -> list[str]:
-    """The policy with the largest gap in each direction, if its 95 % intervals do not overlap.
-
-    The rates are those of the report, over all completed rollouts of a policy.
-    """
-    rows = [
+    compared = [
         row
         for row in rows
         if UNDEFINED not in {row["real"], row["imagined"]} and row["imagined_comparable"]
     ]
-    sentences = []
-    for verb, sign in (("overrates", 1), ("underrates", -1)):
-        low, high = ("real", "imagined") if sign > 0 else ("imagined", "real")
-        separated = [r for r in rows if r[f"{low}_interval"][1] < r[f"{high}_interval"][0]]
-        if separated:
-            row = max(separated, key=lambda r: abs(r["imagined"] - r["real"]))
-            sentences.append(
-                f"Over all completed rollouts, {world} {verb} {len(separated)} of {len(rows)} "
-                "policies beyond chance (95 % intervals do not overlap), most of all "
-                f"{row['policy']!r}: {row['real']:.2f} real, {row['imagined']:.2f} imagined."
-            )
-    return sentences
-
-
-def _why_undefined(rates: Sequence[Mapping[str, float]], world: str) -> str:
-    if len(rates) < MIN_POLICIES:
-        return (
-            f"Pearson is {undefined_by(len(rates))}: it needs at least three policies, since two "
-            "points always lie on a line. The mean absolute error needs no more than one."
-        )
-    same_real = len({rate["real"] for rate in rates}) == 1
-    side, place = ("real", "the real world") if same_real else ("imagined", world)
-    return (
-        "Pearson is undefined: on these starts every policy has the same success rate "
-        f"({rates[0][side]:.2f}) in {place}, so there is nothing to correlate."
+    text = rendered(
+        "comments.txt.j2",
+        rows=rows,
+        found=agreement,
+        world=world,
+        num_compared=len(compared),
+        gaps={
+            "overrates": _separated(compared, "real", "imagined"),
+            "underrates": _separated(compared, "imagined", "real"),
+        },
+        influence=_most_influential(agreement),
+        least_decided=f"{LEAST_DECIDED:.0%}",
+        notable_bias=NOTABLE_BIAS,
+        min_policies=MIN_POLICIES,
+        vague_r=VAGUE_R,
     )
+    return text.splitlines()
+
+
+def _separated(rows: Sequence[Mapping[str, Any]], low: str, high: str) -> list[Mapping[str, Any]]:
+    found = [row for row in rows if row[f"{low}_interval"][1] < row[f"{high}_interval"][0]]
+    return sorted(found, key=lambda row: -abs(row["imagined"] - row["real"]))
+
+
+def _most_influential(agreement: Mapping[str, Any]) -> str | None:
+    """The policy without which Pearson's r would differ most, if it would notably."""
+    r, without = agreement["pearson"], agreement.get("pearson_without", {})
+    moved = {n: abs(one - r) for n, one in without.items() if not isinstance(one, str)}
+    name = max(moved, key=moved.__getitem__, default=None)
+    return name if name is not None and moved[name] >= NOTABLE_INFLUENCE else None

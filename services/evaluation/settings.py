@@ -124,10 +124,6 @@ class TrainPolicySettings(CommandSettings):
     training: CloningSettings = Field(default=CloningSettings(), description="training settings")
     json_path: Path | None = Field(default=None, alias="json", description=JSON_HELP)
 
-    def early_output(self) -> Path:
-        """Path of the early policy."""
-        return self.output.with_stem(f"{self.output.stem}_early")
-
 
 class TrainJudgeSettings(CommandSettings):
     r"""Train the success classifier on true and imagined robot episodes of some stores.

@@ -1,10 +1,8 @@
 """Success rates and classification metrics, their confidence intervals, and draws of both.
 
-Ten starts give little information about a policy, and a bootstrap of a correlation is biased: noise
-in the scores of both worlds shrinks every correlation towards zero, and resampling adds the same
-noise again. `posterior_scores` models that noise; use it for intervals. `bootstrap_scores` is the
-baseline, and shows how often a figure is undefined. `python -m benchmarks agreement` measures how
-often the intervals of both contain the true value.
+A bootstrap of a correlation is biased: noise in the scores of both worlds shrinks it towards zero,
+and resampling adds the same noise again. `posterior_scores` models that noise; use it for
+intervals (`python -m benchmarks agreement`). `bootstrap_scores` shows how often one is undefined.
 """
 
 import math

@@ -64,8 +64,7 @@ class ClassifierShape(FrozenModel):
 class ClassifierBatch:
     """Inputs of the network: last images as bytes, touch, features of object poses, task index.
 
-    Missing inputs are zero and marked in `has_image` and `has_objects`. `imagined` is used in
-    training only; the network does not see it.
+    Missing ones are zero and marked. The network does not see `imagined`, which training uses.
     """
 
     images: UInt8[torch.Tensor, "n 3 h w"]
@@ -166,9 +165,8 @@ def unit_images(images: UInt8[torch.Tensor, "n 3 h w"]) -> Float32[torch.Tensor,
 def probe_batch(endings: Sequence[Ending], shape: ClassifierShape) -> ClassifierBatch:
     """Network tensors of endings, for training and prediction alike.
 
-    Raises:
-        UnknownNameError: a task that the probe was not trained for.
-        InvalidInputError: images of another size, or neither images nor object poses.
+    Raises UnknownNameError for a task that the probe was not trained for, and InvalidInputError for
+    images of another size, or neither images nor object poses.
     """
     for ending in endings:
         _check(ending, shape)
@@ -322,9 +320,7 @@ class SuccessClassifier:
     def log_odds(self, endings: Sequence[Ending]) -> Float64[np.ndarray, "n outputs"]:
         """Uncalibrated log odds of success and of the task's milestones.
 
-        Raises:
-            UnknownNameError: a task that the probe was not trained for.
-            InvalidInputError: no endings, images of another size, or missing images.
+        Raises InvalidInputError without endings, and as `probe_batch`.
         """
         if not endings:
             raise InvalidInputError("success classifier: got no endings, expected at least one")
@@ -358,10 +354,6 @@ class SuccessClassifier:
         return np.array(
             [float(one.probabilities(row[:1])[0]) for one, row in zip(found, odds, strict=True)]
         )
-
-    def probability(self, ending: Ending) -> float:
-        """Probability of success of one ending."""
-        return float(self.probabilities([ending])[0])
 
     def verdicts(self, endings: Sequence[Ending]) -> list[Verdict]:
         """Decision about each ending; raises as `log_odds`."""
@@ -397,11 +389,7 @@ class SuccessClassifier:
         )
 
     def _judged(self, ending: Ending, probability: float) -> tuple[float, str | None]:
-        """Probability of success by all that is known, and why nothing is decided from it.
-
-        The bands are those of the checkpoint, fitted by `calibration`; `probability` is the
-        calibrated one of the probe alone.
-        """
+        """Probability of success by all that is known, and why nothing is decided from it."""
         band = self.calibration(ending.task, imagined=ending.imagined).band
         contradiction = unknown_size = None
         if ending.success_probability is not None:

@@ -1,8 +1,4 @@
-"""Training of the success classifier on true and imagined endings of known outcome.
-
-Three disjoint sets of episodes: training, development (to calibrate the probabilities) and held out
-(for the metrics in the checkpoint).
-"""
+"""Training of the success classifier on true and imagined endings of known outcome."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -201,7 +197,7 @@ def object_scale(batch: ClassifierBatch) -> tuple[torch.Tensor, torch.Tensor]:
 
 @dataclass(frozen=True)
 class ClassifierSets:
-    """Disjoint sets of episodes; no two sets share a start."""
+    """Episodes to train on, to calibrate on, and for metrics; no two sets share a start."""
 
     training: Sequence[EndingEpisode]
     development: Sequence[EndingEpisode]
@@ -268,12 +264,9 @@ def train_success_classifier(
 
     `development` are the episodes to calibrate on, and `held_out` those of the metrics in the
     metadata; by default each is a share of the scenes of `episodes`, true and imagined ones. Each
-    of `jobs` processes trains one task at a time; the weights do not depend on their number. The
-    checkpoint stores the `command`.
-
-    Raises:
-        ConflictError: a held-out or development episode starts like a training episode.
-        InvalidInputError: a task has only one outcome.
+    of `jobs` processes trains one task at a time; the weights do not depend on their number. Raises
+    ConflictError if a held-out or development episode starts like a training episode, and
+    InvalidInputError for a task with only one outcome.
     """
     torch.manual_seed(settings.seed)
     sets = ClassifierSets.split(episodes, settings, development=development, held_out=held_out)
@@ -366,7 +359,6 @@ def _metadata(
 def _calibrated(
     checkpoint: Checkpoint, development: Sequence[EndingEpisode], settings: ClassifierSettings
 ) -> Checkpoint:
-    """The checkpoint with all that is fitted to the development episodes."""
     probe = SuccessClassifier(checkpoint)
     calibrations = fit_calibrations(probe, development, risk=settings.risk)
     fitted = {
@@ -385,7 +377,6 @@ def _calibrated(
 
 
 def _with(checkpoint: Checkpoint, part: str, added: Mapping[str, object]) -> Checkpoint:
-    """The checkpoint with more settings or metrics, as `part` says."""
     metadata = checkpoint.metadata
     update = {part: {**getattr(metadata, part), **added}}
     return replace(checkpoint, metadata=metadata.model_copy(update=update))
@@ -429,7 +420,6 @@ def _optimized(
 
 
 def _loss(odds: torch.Tensor, outcome: torch.Tensor, known: torch.Tensor) -> torch.Tensor:
-    """Cross entropy of success and, with less weight, milestones, where they are known."""
     each = functional.binary_cross_entropy_with_logits(odds, outcome, reduction="none") * known
     success = each[:, 0].sum() / known[:, 0].sum().clamp_min(1)
     milestones = each[:, 1:].sum() / known[:, 1:].sum().clamp_min(1)

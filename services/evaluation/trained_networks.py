@@ -26,11 +26,7 @@ _METADATA_KEY, _PREFIX = "dextouch", "network."
 
 
 class CheckpointMetadata(FrozenModel):
-    """Provenance of a network.
-
-    Evaluations must not contain any of `training_episodes` and `training_starts` (digests of first
-    observations).
-    """
+    """Provenance of a network; no evaluation may begin from its starts (digests)."""
 
     kind: str
     format_version: int = FORMAT_VERSION
@@ -61,12 +57,7 @@ def network_tensors(network: nn.Module, *, halved: Collection[str] = ()) -> dict
 
 
 def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
-    """Write the file atomically.
-
-    Raises:
-        NonFiniteError: weights that are not finite.
-        LimitExceededError: more than 8 MiB.
-    """
+    """Write the file atomically; raises NonFiniteError, or LimitExceededError over 8 MiB."""
     refuse_non_finite(checkpoint.tensors, "checkpoint")
     size = sum(t.numel() * t.element_size() for t in checkpoint.tensors.values())
     if size > MAX_CHECKPOINT_BYTES:
@@ -79,9 +70,7 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
 def load_checkpoint(path: Path, *, kind: str | tuple[str, ...]) -> Checkpoint:
     """Read a checkpoint of a kind, or of one of several.
 
-    Raises:
-        NotFoundError, LimitExceededError, CorruptDataError, NonFiniteError: as `read_weights`.
-        InvalidInputError: a checkpoint of another kind or a newer format.
+    Raises as `read_weights`, and InvalidInputError for a checkpoint of another kind.
     """
     tensors, metadata, _ = read_weights(
         path, CheckpointMetadata, _METADATA_KEY, max_bytes=2 * MAX_CHECKPOINT_BYTES
@@ -111,11 +100,7 @@ def optimized(
     title: str,
     max_gradient_norm: float | None = 1.0,
 ) -> Iterator[Budget]:
-    """Train a network; yields the used budget after each step.
-
-    `loss` is that of a batch drawn with the generator. Gradients are clipped to
-    `max_gradient_norm`, unless it is None.
-    """
+    """Train a network by losses of drawn batches; yields the used budget after each step."""
     generator = torch.Generator().manual_seed(settings.seed)
     budget = Budget(settings.max_cpu_s, settings.num_training_steps)
     options = OptimizerOptions(

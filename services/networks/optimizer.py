@@ -47,11 +47,7 @@ class OptimizerOptions:
 class Budget:
     """Completed steps, CPU and wall seconds of a run; it ends when one of them reaches its limit.
 
-    Args:
-        max_cpu_s: limit of CPU seconds.
-        max_steps: limit of steps; None for no limit.
-        max_wall_s: limit of wall seconds.
-        paced_by_steps: whether the schedule follows the steps alone, where these have a limit.
+    With `paced_by_steps` the schedule follows the steps alone, where these have a limit.
     """
 
     def __init__(
@@ -102,13 +98,7 @@ class Budget:
 
 
 class OptimizerLoop:
-    """Training of one network until its budget is used up.
-
-    Args:
-        network: network whose weights are changed, but for those that need no gradient.
-        options: learning rate, weight decay and so on.
-        budget: limits of the run.
-    """
+    """Training of one network until its budget is used up; weights without gradient stay."""
 
     def __init__(self, network: nn.Module, options: OptimizerOptions, budget: Budget) -> None:
         self.options, self.budget = options, budget
@@ -133,19 +123,14 @@ class OptimizerLoop:
     def learn(self, loss: Tensor) -> None:
         """Take one step down the gradient of a loss; the budget does not advance.
 
-        Raises:
-            NonFiniteError: gradients that are NaN or infinite.
+        Raises NonFiniteError for gradients that are NaN or infinite.
         """
         self.optimizer.zero_grad()
         torch.autograd.backward(loss)
         self.step(loss=loss)
 
     def step(self, **losses: Tensor) -> None:
-        """Take one step down the gradients that the weights have; as `learn`.
-
-        Args:
-            losses: what error messages say of the step.
-        """
+        """Take one step down the gradients that the weights have; errors show the losses."""
         for group in self.optimizer.param_groups:
             group["lr"] = self.options.rate(self.budget.step, self.budget.schedule_share())
         if self.options.max_gradient_norm is not None:
@@ -174,13 +159,8 @@ def update_average(
 ) -> None:
     """Move averaged weights towards those of a network (exponential moving average).
 
-    Its memory is shorter at first, so that short runs do not keep the initial weights.
-
-    Args:
-        averaged: averages, which are changed.
-        weights: weights of the same shapes, in the same order.
-        decay: decay after many updates, such as 0.995.
-        num_updates: number of updates before this one.
+    The decay is reached after many updates: with few before this one the memory is shorter, so that
+    short runs do not keep the initial weights.
     """
     decay = min(decay, (1 + num_updates) / (10 + num_updates))
     for mean, weight in zip(averaged, weights, strict=True):

@@ -34,8 +34,7 @@ Network = TypeVar("Network", bound=nn.Module)
 def half_weights(model: nn.Module, *, prefix: str = "") -> dict[str, Tensor]:
     """Learned weights as float16 and statistics as float32, with prefixed names.
 
-    Raises:
-        NonFiniteError: weights that are NaN, infinite, or too large for float16.
+    Raises NonFiniteError for weights that are NaN, infinite, or too large for float16.
     """
     learned = {name for name, _ in model.named_parameters()}
     tensors = {
@@ -117,11 +116,7 @@ def _check_exists(path: Path) -> None:
 
 
 def read_tensors(path: Path, where: str) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Read the tensors and the metadata of any safetensors file; `where` begins error messages.
-
-    Raises:
-        CorruptDataError: not a safetensors file.
-    """
+    """Tensors and metadata of a safetensors file; raises CorruptDataError for another."""
     try:
         with safe_open(path, framework="pt") as file:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
@@ -165,10 +160,8 @@ def load_strictly(
     """Load tensors into models in their precision, for inference; the names must match exactly.
 
     Models are keyed by the prefix of their tensor names. Of tensors that are named by `later` and
-    that older files do not have, a model keeps its own values.
-
-    Raises:
-        InvalidInputError: missing or unexpected tensors, wrong shapes or kinds of numbers.
+    that older files do not have, a model keeps its own values. Raises InvalidInputError for missing
+    or unexpected tensors, wrong shapes or kinds of numbers.
     """
     expected = {
         prefix + name: value
@@ -212,9 +205,8 @@ def refuse_non_finite(tensors: Mapping[str, Tensor], where: str) -> None:
 def on_device(network: Network, device: str) -> Network:
     """Move a network to a device, in place.
 
-    Raises:
-        UnavailableError: torch has no such device here.
-        LimitExceededError: a CUDA device with less free memory than the weights need.
+    Raises UnavailableError if torch has no such device here, and LimitExceededError for a CUDA
+    device with less free memory than the weights need.
     """
     try:
         place = torch.device(device)
@@ -256,11 +248,7 @@ def fill(tensor: Tensor, whole: Tensor) -> None:
 
 
 def check_memory(num_bytes: int, *, where: str, max_bytes: int | None = None) -> None:
-    """Refuse weights that need more than `max_bytes`; None: than the memory that is available.
-
-    Raises:
-        LimitExceededError: more than the limit.
-    """
+    """Raise LimitExceededError for weights that need more than a limit, or than is available."""
     limit = available_memory() if max_bytes is None else max_bytes
     if limit is not None and num_bytes > limit:
         raise LimitExceededError(

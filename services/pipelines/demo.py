@@ -28,14 +28,15 @@ from services.episode_store.settings import EpisodeStoreSettings
 from services.evaluation.command_line import print_scores
 from services.evaluation.prediction import ALL_TASKS, all_metrics, described, measure_prediction
 from services.evaluation.prediction_scenes import read_rollout
-from services.evaluation.reporting import (
+from services.evaluation.reporting import write_report
+from services.evaluation.reporting.pictures import (
     PredictionPicture,
     ReportPictures,
     action_picture,
     episode_picture,
-    write_report,
 )
-from services.evaluation.reporting.sections import comparison_bars, error_rows, figure
+from services.evaluation.reporting.sections import comparison_bars, error_rows
+from services.evaluation.templates import figure
 from services.pipelines import demo_scoring as scoring
 from services.pipelines import demo_takes as recording
 from services.pipelines.parsers import FIRST_HELD_OUT_SEED, TASKS, DemoPlan, demo_plan
@@ -162,10 +163,7 @@ def run(plan: DemoPlan, folder: Path) -> dict[str, Any]:
 
 
 def _apps(jobs_folder: Path, world_model: World[Any]) -> dict[str, FastAPI]:
-    """Store, alignment, the twin as the real world, and the model beside a baseline.
-
-    Jobs are apart from the store, which may have a running alignment service.
-    """
+    """Services of the demo; jobs are apart from the store, which may have a running alignment."""
     store = default_store()
     alignment = AlignmentSettings(
         store_url=store, jobs_folder=jobs_folder, align_new=False, log_level="warning"
@@ -266,7 +264,6 @@ def _table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]] = (
 
 
 def _mistakes(rows: Sequence[Mapping[str, Any]]) -> Table:
-    """Successes in both worlds, by kind of mistake."""
     names = ("rollouts", "real", "imagined", "wrong", "cannot_tell")
     columns = ("task", "mistake", "rollouts", "real", "imagined", "wrongly imagined", "undecided")
     cells = [(row["task"], row["mistake"], *(str(row[name]) for name in names)) for row in rows]

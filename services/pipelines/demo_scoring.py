@@ -9,22 +9,21 @@ from dextouch.clients import Policy, RolloutClient
 from dextouch.errors import DexTouchError
 from dextouch.worlds import BatchWorld
 from services.evaluation.bundled_policies import DEFAULT_POLICY
-from services.evaluation.closed_loop import EvaluationPlan, evaluate
+from services.evaluation.closed_loop import EvaluationPlan, evaluate, film
 from services.evaluation.command_line import run_train_judge, run_train_policy
-from services.evaluation.filmed_pairs import film
 from services.evaluation.matched_starts import WorldAddress
 from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
-from services.evaluation.reporting import PredictionPicture
+from services.evaluation.reporting.pictures import PredictionPicture
 from services.evaluation.scores import REAL, RolloutScore
 from services.evaluation.settings import DEFAULT_PROBE
 from services.evaluation.success_classifier import SuccessClassifier
 from services.pipelines import imagined_data, training_data
 from services.pipelines.parsers import TASKS, DemoPlan
 from services.pipelines.study import demonstrator
-from services.twin.scripted_actions import ELSEWHERE, HOLD, RETREAT, script_name
+from services.twin.stage import ELSEWHERE, HOLD, RETREAT, script_name
 from services.twin.tasks import get_task
 from services.world_model.command_line import run_train
-from services.world_model.shipped_checkpoints import default_checkpoint
+from services.world_model.settings import default_checkpoint
 from services.world_model.world import open_world
 
 MODEL = "world_model"
@@ -64,10 +63,8 @@ def committed_models() -> Models:
 def train_models(folder: Path) -> Models:
     """Record training episodes and train a small state model, a policy and a success classifier.
 
-    The probe is trained on true endings and on those imagined by the state model.
-
-    Args:
-        folder: folder of episodes and checkpoints; existing episodes are reused.
+    The probe is trained on true endings and on those imagined by the state model. The folder is for
+    episodes, of which existing ones are reused, and checkpoints.
     """
     episodes, exact, endings, unseen, imagined = (
         str(folder / name) for name in ("episodes", "exact", "endings", "unseen", "imagined")
@@ -128,9 +125,7 @@ def score_policies(
 ) -> tuple[dict[str, Any], tuple[PredictionPicture, ...]]:
     """Roll out all policies from matched starts in the twin, the model and the copy baseline.
 
-    Returns:
-        `policies`, `agreement`, `mistakes` and other entries of `report.json`, and a pair of
-        rollouts of every task to show.
+    Returns entries of `report.json`, and a pair of rollouts of every task to show.
     """
     twin, imagined = RolloutClient(urls["twin"]), RolloutClient(urls["imagined"])
     tasks = EvaluationPlan(

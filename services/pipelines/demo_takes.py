@@ -1,8 +1,4 @@
-"""The demo's takes: recorded in the twin, played through mock devices, aligned and compared.
-
-The path is the real one: mock devices send packets, real drivers decode them, the recorder spools,
-the uploader sends over HTTP, the alignment service creates the episode.
-"""
+"""The demo's takes: recorded in the twin, played through mock devices, aligned and compared."""
 
 import json
 import os
@@ -23,7 +19,7 @@ from dextouch.jobs import Workers, results_of, run_jobs
 from dextouch.schemas import RecordingAttributes, TakePrompt
 from services.acquisition.mock_station import MockTake
 from services.acquisition.mocks.faults import Fate
-from services.acquisition.mocks.replay import replay_calibration, replay_streams
+from services.acquisition.mocks.replay import replay_streams
 from services.acquisition.uploader import Uploader
 from services.alignment.jobs import align_recording
 from services.alignment.recording_error import compare_with_truth, match_streams
@@ -105,7 +101,7 @@ def record_take(
             task=attributes.task, instruction=attributes.instruction, domain=attributes.domain
         ),
         attributes.success,
-        calibration={**replay_calibration(truth), **gloves},
+        calibration={**truth.attributes.matrices(), **gloves},
         recording_id=f"demo-{attributes.domain}",
         seed=seed,
         unit_seed=seed,
@@ -169,9 +165,7 @@ def upload(spool_root: Path, store_url: str) -> None:
 def align(alignment_url: str, recording_id: str) -> AlignmentJob:
     """Align a recording with the alignment service, and wait for the job.
 
-    Raises:
-        DexTouchError: what the service refused, with its reason.
-        UnavailableError: it does not answer.
+    Raises what the service refused, with its reason, or UnavailableError if it does not answer.
     """
     link = HttpLink(alignment_url, timeout_s=ALIGNMENT_TIMEOUT_S)
     body = json.dumps({"recording_id": recording_id}).encode()
@@ -185,13 +179,7 @@ def align(alignment_url: str, recording_id: str) -> AlignmentJob:
 
 
 def align_truly(take: MockTake, store: EpisodeStore, options: AlignmentOptions) -> EpisodeReader:
-    """Align a take as if its gloves and path delays had been calibrated without error.
-
-    Args:
-        take: still in its spool.
-        store: for the recording with its true calibration, and the episode.
-        options: of the other alignment.
-    """
+    """Align a take of the spool as if its calibration had no error; a store gets both."""
     attributes = SpoolReader(take.spool_path).attributes
     calibration = {**attributes.calibration, **take.true_calibration}
     commit_spool(store, take.spool_path, attributes.model_copy(update={"calibration": calibration}))

@@ -1,8 +1,4 @@
-"""Commands that judge world models and policies by episodes of a store.
-
-`dextouch evaluate prediction` measures predicted images and touch on held-out episodes,
-`dextouch evaluate recorded` scores policies from recorded first observations.
-"""
+"""Commands that judge world models and policies by episodes of a store."""
 
 import argparse
 from collections.abc import Callable, Mapping, Sequence
@@ -36,7 +32,7 @@ from services.evaluation.success_classifier import SuccessClassifier
 from services.pipelines.imagined_data import WORLD, refuse_trained_episodes, served_world
 from services.pipelines.parsers import prediction_parser, recorded_parser
 from services.world_model.network.model import Sampling
-from services.world_model.shipped_checkpoints import default_checkpoint
+from services.world_model.settings import default_checkpoint
 from services.world_model.world import open_world
 
 _HORIZONS: dict[str, Callable[[EpisodeReader], list[Scene]]] = {
@@ -157,12 +153,6 @@ def recorded_main(arguments: Sequence[str]) -> int:
 
 
 def _policies(options: argparse.Namespace) -> dict[str, Policy]:
-    """All requested policies by name.
-
-    Raises:
-        InvalidInputError: two policies of one name, or one that does not load.
-        UnknownNameError: arguments of a policy that is not given.
-    """
     held = ["hold"] if options.hold else []
     others = [REPLAY, *(name for name, _ in options.cloned), *held]
     policies = load_policies(

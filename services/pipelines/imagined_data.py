@@ -19,12 +19,12 @@ from dextouch.serving import configure_logging
 from dextouch.worlds import World, WorldServiceSettings, create_world_app
 from services.evaluation.endings import NUM_SEEN_STEPS, early_step, middle_step
 from services.evaluation.progress import Progress
-from services.evaluation.reporting import (
+from services.evaluation.reporting import write_report
+from services.evaluation.reporting.pictures import (
     MAX_MOVING,
     PredictionPicture,
     ReportPictures,
     episode_pair,
-    write_report,
 )
 from services.generation import SHORT_CHUNK_STEPS, imagine_episode, whole_steps
 from services.pipelines.parsers import generate_parser, imagined_parser
@@ -227,7 +227,6 @@ def refuse_trained_episodes(
 def _picture(
     source: EpisodeStore, imagined: EpisodeReader, num_moments: int | None
 ) -> PredictionPicture:
-    """An episode beside its true one, as `episode_pair`."""
     (true_id,) = {one.id for one in imagined.attributes.lineage if one.kind == "episode"}
     title = f"{imagined.attributes.task}: {true_id}"
     return episode_pair(title, source.open(true_id), imagined, num_moments)

@@ -1,14 +1,7 @@
 """Takes of the twin recorded by a mock station: packets, real drivers, recorder and spool.
 
-The mock gloves know their own tare and gain, and their script its path delay; all are measured the
-same as at a station, by a rest take, known pressures and answers to time requests, so that errors
-contain those of a calibration.
-
-`write_by_station` makes episodes of such takes in one process: the way from a person's hands to
-67-D actions of the robot, without HTTP. Episodes have the errors of an ordinary station (clocks,
-delays, tracking, calibration, lost packets) and, as labels, what only the twin knows: object poses,
-milestones and success. Labels are on the episode's time axis: the clock of the simulated host is
-that of the simulation.
+Tare, gain and path delay are measured as at a station, by a rest take, known pressures and answers
+to time requests, so that errors contain those of a calibration.
 """
 
 import tempfile
@@ -42,7 +35,7 @@ from services.acquisition.mock_station import MockStation, MockTake
 from services.acquisition.mocks.faults import FaultScript
 from services.acquisition.mocks.pattern import pattern_streams
 from services.acquisition.mocks.replay import PLAYED_KINDS, ReplayStream
-from services.acquisition.path_latency import add_latencies
+from services.acquisition.watches import add_latencies
 from services.alignment.calibration.tactile_gain import TaxelPress, calibrate_glove
 from services.alignment.calibration.tactile_tare import measure_tare, reading_step
 from services.alignment.retargeting import warm_up
@@ -68,6 +61,7 @@ SESSION_SEEDS: Final = 20
 # As in docs/twin_closure.md: with wrists as tracked, the robot's hand touches something else.
 ALIGNMENT: Final = AlignmentOptions(wrist="touch")
 LABELS: Final = "object_poses"
+_warm_up_once = lru_cache(maxsize=1)(warm_up)
 # What training reads, beside images.
 _TRAINED: Final = ("action", "action_commanded", "tactile_left", "tactile_right", LABELS)
 
@@ -126,14 +120,8 @@ def measure_gloves(
 
     By default the take runs in real time, in which the station asks its gloves for their time, and
     path delays are measured, too. With a virtual clock they are not (a mock station knows them with
-    an error), but equal arguments give equal matrices.
-
-    Args:
-        streams: of the take that follows; its gloves are calibrated.
-        spool_root: folder for the calibration takes.
-        seed: of the mock station, whose gloves differ by seed, and of the errors of the pressures.
-        clock: of the station.
-
+    an error), but equal arguments give equal matrices. The seed is that of the mock station, whose
+    gloves differ by it, and of the errors of the pressures; `spool_root` is for calibration takes.
     Raises UnavailableError if a glove's path delay could not be measured in several takes.
     """
     gloves = {side: s for s in streams for side in SIDES if s.descriptor.name == f"tactile_{side}"}
@@ -201,7 +189,6 @@ def _pressed(stream: ReplayStream, true_kpa: Float64[np.ndarray, " parts"]) -> R
 
 
 def _parts(take: MockTake, side: Side) -> Iterator[Float64[np.ndarray, "time cells"]]:
-    """Readings of the rest and of every press."""
     spool, name = SpoolReader(take.spool_path), f"tactile_{side}"
     batch = spool.read(name)
     # By the number of the sample: when it came depends on the machine's other work.
@@ -231,17 +218,9 @@ def write_by_station(
     `objects`, poses of objects are those of the markers in the images, and of the twin's truth the
     episode has only the outcome, which an operator would see. The recording itself is not kept.
 
-    Args:
-        store: where the episode goes.
-        truth: recorded with `device_options`; with `objects` by a stage that shows the markers.
-        objects: of the task, with their markers.
-        episode_id: of the new episode.
-        options: `streams` and `image_every` say what the episode has.
-
-    Raises:
-        ConflictError: the episode exists.
-        InvalidInputError: the take could not be aligned.
-        DeviceError: a mock device failed.
+    The truth is recorded with `device_options`, with `objects` by a stage that shows the markers;
+    `streams` and `image_every` of the options say what the episode has. Raises ConflictError if it
+    exists, InvalidInputError if the take could not be aligned, DeviceError if a mock device failed.
     """
     alignment = ALIGNMENT.model_copy(update={"objects": objects}) if objects else ALIGNMENT
     attributes, streams, origin_ns = _aligned(truth, alignment, episode_id)
@@ -257,14 +236,11 @@ def write_by_station(
 def _aligned(
     truth: TruthEpisode, alignment: AlignmentOptions, episode_id: str
 ) -> tuple[EpisodeAttributes, list[TruthStream], int]:
-    """Play a take through a mock station and align its recording.
-
-    Returns attributes and streams of the episode, and its time 0 (ns) on the axis of the truth.
-    """
+    """Attributes and streams of an episode, and its time 0 (ns) on the axis of the truth."""
     about = truth.attributes
     if about.seed is None:
         raise InvalidInputError(f"device takes: {episode_id} has no seed; expected a twin's take")
-    _warm_up()
+    _warm_up_once()
     session = about.seed // SESSION_SEEDS
     plan = TakePlan(
         _played(truth.streams),
@@ -297,7 +273,6 @@ def _write(
     streams: Sequence[TruthStream],
     options: TakeOptions,
 ) -> None:
-    """Write those streams and images that the options ask for."""
     written = list(streams)
     if options.streams == "training":
         names = (*_TRAINED, *options.images, *map(object_stream, attributes.object_names))
@@ -311,22 +286,14 @@ def _write(
             to.append(one.descriptor.name, values=one.values, t_ref_ns=one.t_ref_ns)
 
 
-@lru_cache(maxsize=1)
-def _warm_up() -> None:
-    """Load the compiled solver once per process."""
-    warm_up()
-
-
 @lru_cache(maxsize=4)
 def _session_gloves(session: int) -> dict[str, Matrix]:
-    """Calibration of the gloves of a session, measured by a take with known pressures."""
     gloves = [stream for stream in pattern_streams(1.0) if stream.descriptor.kind == "tactile"]
     with tempfile.TemporaryDirectory(prefix="dextouch-calibration-") as folder:
         return measure_gloves(gloves, Path(folder), seed=session, clock=VirtualClock())
 
 
 def _played(streams: Mapping[str, TruthStream]) -> list[ReplayStream]:
-    """Streams that devices send; actions are made by alignment."""
     return [
         ReplayStream(stream.descriptor, stream.t_ref_ns, stream.values)
         for name, stream in streams.items()
@@ -354,7 +321,6 @@ def _label(truth: TruthStream, origin_ns: int, grid_ns: np.ndarray) -> TruthStre
 
 
 def _thinned(stream: TruthStream, grid_ns: np.ndarray, image_every: int) -> TruthStream:
-    """An image stream with the images nearest to every N-th step and to the last three."""
     if stream.descriptor.kind != "image":
         return stream
     steps = sorted(

@@ -1,9 +1,9 @@
 """Parsers of commands that join services; importing them imports none of the work."""
 
 import argparse
-import json
 import math
-from collections.abc import Mapping, Sequence
+import tomllib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -24,7 +24,7 @@ from services.twin.names import (
     TAKE_PATHS,
     TASK_SETS,
 )
-from services.world_model.shipped_checkpoints import default_checkpoint
+from services.world_model.settings import default_checkpoint
 
 # Formats with one file per episode or recording, and those with all episodes together.
 SINGLE_FORMATS, JOINT_FORMATS = ("mcap", "rrd"), ("umi", "lerobot")
@@ -41,121 +41,8 @@ _FORMATS_OF = {
     "touch_images": ("mcap",),
     "touch_samples": ("lerobot",),
 }
-_TRAINING_DATA = """\
-Record twin episodes for training and testing networks.
-
-The data set covers the factors that decide success: errors of a few millimetres, misses, takes that
-stop or never start, retreats, pushes, slipping grasps, wandering hands, and actions of another
-scene. `--mix` selects their shares. With `--policy` every episode is a rollout of that policy in
-the twin instead. Interrupted runs resume: existing episodes are kept.
-
-Human takes are recorded like those of a person: the twin's hands are played to mock devices, whose
-packets go through the drivers, the recorder and alignment to actions of the robot. With
-`--path station`, robot takes are recorded so, too, and nothing but the outcome comes from the twin:
-the poses of objects are measured by markers on them, which the head camera sees.
-"""
-_IMAGINED = """\
-Predict the robot episodes of a store with the world model, to train the success classifier on them.
-
-Each imagined episode has the outcome of the same actions in the twin. The success classifier is
-trained on real and imagined episodes, so that its probabilities are valid for imagined endings, and
-evaluated on those of other seeds. A state model renders only the images that it uses.
-"""
-_GENERATE = """\
-Generate demonstrations: a world model predicts images and touch for recorded robot actions.
-
-Every imagined episode keeps the first observation and the actions of its source, a robot episode
-that the world model was not trained on; later images and touch are predicted. Its `success` is that
-of the source. Training commands skip imagined episodes, except `dextouch train policy --imagined`.
-Existing results are kept, so an interrupted run can be repeated.
-"""
-_GENERATE_EXAMPLE = """\
-example:
-  dextouch train world-model --episodes runs/episodes --splits B,C --output runs/robot.safetensors
-  dextouch generate --episodes runs/episodes --split A --checkpoint runs/robot.safetensors \\
-    --store runs/generated --strips runs/generated.html
-"""
-_PREDICTION = """\
-Measure how well a world model predicts the images and touch of held-out robot episodes.
-
-Every figure stands beside those of simple baselines: a repeated first step, the first image warped
-by the camera's known motion, no touch, the model's codecs alone, and the model with other actions.
-Windows of one chunk begin at true steps, as in the paper; rollouts continue from predictions.
-"""
-_PREDICTION_EXAMPLES = """\
-examples:
-  dextouch evaluate prediction --episodes runs/heldout
-  dextouch evaluate prediction --episodes runs/heldout --checkpoint runs/paper.safetensors \\
-    --horizon windows --metrics psnr,contact_f1 --json runs/prediction.json
-"""
-_RECORDED = """\
-Score policies in a world model from the first observations of recorded takes.
-
-For labs whose real world is a robot: takes are robot episodes with an outcome, of a station or of
-the twin. Their own actions are replayed in the world model first; how well its verdicts match the
-outcomes says how far the policies' scores can be trusted. Takes that the model was trained on are
-refused.
-"""
-_RECORDED_EXAMPLES = """\
-examples:
-  dextouch evaluate recorded --episodes runs/takes --checkpoint runs/state.safetensors \\
-    --probe runs/probe.safetensors --split A
-  dextouch evaluate recorded --episodes runs/takes --policy mine=my_policy:MyPolicy \\
-    --cloned cloned=runs/cloned.safetensors --json runs/scores.json
-"""
-_STUDY_EXAMPLE = """\
-example:
-  dextouch study run study.toml
-
-A study file:
-
-  name = "touch"
-  tasks = ["stand_bottle", "stack_bowls"]
-  first_seed = 31000
-  num_starts = 10
-
-  [imagined.model]
-  builtin = "world-model"
-
-  [policies.careful]
-  script = "script 5 mm"
-  [policies.mine]
-  factory = "package.module:make_policy"
-
-All keys of a study file: docs/studies.md
-"""
-_EXPORT_HELP = """\
-formats:
-  lerobot  a LeRobotDataset v3.0 folder: episodes on a frame grid, video, parquet, card
-  umi      one zip with a Zarr v2 replay buffer: episodes on the model grid
-           (cannot be imported)
-  mcap     one file per episode or recording, every sample; opens in Foxglove
-  rrd      one file per episode or recording, every sample; opens in Rerun
-           (imported as a recording of what it shows)
-
-examples:
-  dextouch export --format mcap stand-bottle-0003 --to take.mcap
-  dextouch export --format mcap --kind recording --operator p17 --to takes/
-  dextouch export --format mcap --outcome success --after 2026-05-04 --to takes/
-  dextouch export --format lerobot --task stand_bottle --to data/lerobot
-  dextouch export --format lerobot --to data/lerobot --append --license cc-by-4.0
-  dextouch export --format umi --domain robot --to robot.zarr.zip
-  dextouch export --format rrd stand-bottle-0003 --to take.rrd
-"""
-_IMPORT_HELP = """\
-examples:
-  dextouch import take.mcap --map camera_head=/camera/color/image_raw/compressed \\
-      --map wrist_left=/tf:left_hand --map tactile_left=/glove/left
-  dextouch import --format mcap takes/
-  dextouch import run.rrd --timeline frame_time
-  dextouch import data/lerobot --id-prefix theirs-
-  dextouch import aloha --map camera_head=observation.images.top --k-head 600,600,320,240
-
-Files that DexTouch exported come back as they were. Every other mcap or rrd file becomes a
-recording of the streams that it has, and a report says what was not imported, and why. So does
-every episode of a LeRobot data set (v2 or v3), unless it has our actions and a head camera.
-What each format keeps and loses: docs/bridges.md
-"""
+# Descriptions and examples by command.
+_WORDS = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 TASKS = ("stand_bottle", "stack_bowls")
 # No training or tuning uses seeds from 30000 on; the evaluator benchmark takes the first ones.
 FIRST_HELD_OUT_SEED = 31_000
@@ -179,16 +66,6 @@ def _named_path(text: str) -> tuple[str, Path]:
     if not (separator and name and path):
         raise argparse.ArgumentTypeError(f"got {text!r}, expected NAME=CHECKPOINT")
     return name, Path(path)
-
-
-def _keywords_by_name(text: str) -> Mapping[str, Any]:
-    try:
-        found = json.loads(text)
-    except json.JSONDecodeError as error:
-        raise argparse.ArgumentTypeError(f"got {text!r}, expected a JSON object") from error
-    if not isinstance(found, dict) or not all(isinstance(one, dict) for one in found.values()):
-        raise argparse.ArgumentTypeError(f"got {text!r}, expected an object of objects")
-    return found
 
 
 def _whole_fps(text: str) -> int:
@@ -216,19 +93,23 @@ def _moment(text: str) -> datetime:
 
 
 def _keywords(text: str) -> dict[str, Any]:
+    return _parsed(text, dict[str, Any], "a JSON object")
+
+
+def _keywords_by_name(text: str) -> dict[str, dict[str, Any]]:
+    return _parsed(text, dict[str, dict[str, Any]], "an object of objects")
+
+
+def _parsed(text: str, form: Any, expected: str) -> Any:  # noqa: ANN401 - of this form
     try:
-        return TypeAdapter(dict[str, Any]).validate_json(text)
+        return TypeAdapter(form).validate_json(text)
     except ValidationError as error:
-        raise argparse.ArgumentTypeError(f"got {text!r}, expected a JSON object") from error
+        raise argparse.ArgumentTypeError(f"got {text!r}, expected {expected}") from error
 
 
 def training_data_parser() -> argparse.ArgumentParser:
     """Parser of `dextouch train data`."""
-    parser = CommandParser(
-        prog="dextouch train data",
-        description=_TRAINING_DATA,
-        epilog="example:\n  dextouch train data --store runs/episodes --count 20 --images 4",
-    )
+    parser = _parser("train data")
     add = parser.add_argument
     add("--store", required=True, help="folder of the episode store")
     add("--first", type=int, default=0, help="first seed (%(default)s)")
@@ -266,9 +147,12 @@ def training_data_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _imagination_parser(**about: str) -> CommandParser:
-    """Parser of a command that imagines episodes; `imagine` takes what it parses."""
-    parser = CommandParser(**about)
+def _parser(command: str) -> CommandParser:
+    return CommandParser(prog=f"dextouch {command}", **_WORDS[command])
+
+
+def _imagination_parser(command: str) -> CommandParser:
+    parser = _parser(command)
     add = parser.add_argument
     add("--episodes", required=True, metavar="URL", help="store of the episodes to imagine")
     add("--store", required=True, metavar="URL", help="store for the imagined episodes")
@@ -284,18 +168,12 @@ def _imagination_parser(**about: str) -> CommandParser:
 
 def imagined_parser() -> argparse.ArgumentParser:
     """Parser of `dextouch train imagined`."""
-    return _imagination_parser(
-        prog="dextouch train imagined",
-        description=_IMAGINED,
-        epilog="example:\n  dextouch train imagined --episodes runs/episodes --store runs/imagined",
-    )
+    return _imagination_parser("train imagined")
 
 
 def generate_parser() -> argparse.ArgumentParser:
     """Parser of `dextouch generate`."""
-    parser = _imagination_parser(
-        prog="dextouch generate", description=_GENERATE, epilog=_GENERATE_EXAMPLE
-    )
+    parser = _imagination_parser("generate")
     add = parser.add_argument
     add("--count", type=positive, metavar="N", help="largest number of episodes, over all tasks")
     add("--with-failures", action="store_true", help="also imagine episodes that failed")
@@ -307,9 +185,7 @@ def generate_parser() -> argparse.ArgumentParser:
 
 def prediction_parser() -> argparse.ArgumentParser:
     """Parser of `dextouch evaluate prediction`."""
-    parser = CommandParser(
-        prog="dextouch evaluate prediction", description=_PREDICTION, epilog=_PREDICTION_EXAMPLES
-    )
+    parser = _parser("evaluate prediction")
     add = parser.add_argument
     add("--episodes", required=True, metavar="STORE", help="store of held-out episodes")
     add("--checkpoint", type=Path, metavar="PATH", help="world model (default: the package's)")
@@ -336,9 +212,7 @@ def recorded_parser() -> argparse.ArgumentParser:
     # Settings need a package that reading and writing files does not.
     from services.evaluation.settings import DEFAULT_PROBE
 
-    parser = CommandParser(
-        prog="dextouch evaluate recorded", description=_RECORDED, epilog=_RECORDED_EXAMPLES
-    )
+    parser = _parser("evaluate recorded")
     add = parser.add_argument
     stores = "stores of the takes"
     add("--episodes", required=True, type=comma_separated, metavar="URL,…", help=stores)
@@ -368,13 +242,7 @@ def study_parser() -> argparse.ArgumentParser:
         epilog="`dextouch study serve` shows the results on the dashboard.",
     )
     words = parser.add_subparsers(dest="word", required=True, metavar="COMMAND")
-    run = words.add_parser(
-        "run",
-        help="run a study, or continue it",
-        description="Run the rollouts of a study that have no result yet, and write its report. "
-        "A study may be interrupted at any time; the same command continues it.",
-        epilog=_STUDY_EXAMPLE,
-    )
+    run = words.add_parser("run", help="run a study, or continue it", **_WORDS["study run"])
     run.add_argument("study", type=Path, metavar="STUDY", help="study file (TOML)")
     run.add_argument(
         "--folder",
@@ -392,21 +260,16 @@ def study_parser() -> argparse.ArgumentParser:
         "--retry-failed", action="store_true", help="run rollouts again that failed before"
     )
     run.add_argument("--ray", metavar="ADDRESS", help=RAY_HELP)
-    report = words.add_parser(
-        "report",
-        help="write the report of a study's results so far",
-        description="Write report.json, a page for each imagined world, and tables.tex from the "
-        "results of a study, finished or not.",
-        epilog="example:\n  dextouch study report runs/touch",
-    )
+    about = "write the report of a study's results so far"
+    report = words.add_parser("report", help=about, **_WORDS["study report"])
     report.add_argument("folder", type=Path, metavar="FOLDER", help="folder of the study")
     for one in (run, report):
         add_json(one)
     return parser
 
 
-def _bridge_parser(word: str, does: str, more: str) -> argparse.ArgumentParser:
-    parser = CommandParser(prog=f"dextouch {word}", description=does, epilog=more)
+def _bridge_parser(command: str) -> argparse.ArgumentParser:
+    parser = _parser(command)
     store = "the store (%(default)s)"
     parser.add_argument("--store", metavar="URL", default=default_store(), help=store)
     add_json(parser)
@@ -414,7 +277,6 @@ def _bridge_parser(word: str, does: str, more: str) -> argparse.ArgumentParser:
 
 
 def _add_filters(parser: argparse.ArgumentParser) -> None:
-    """Add the filters of the dashboard's list, by the names that `ItemFilter` has."""
     about = "only items that match all of them; a DAY may be a time, too"
     add = parser.add_argument_group("filters", about).add_argument
     add("--text", metavar="TEXT", help="in id, task, instruction, operator, station or trace")
@@ -432,7 +294,7 @@ def _add_filters(parser: argparse.ArgumentParser) -> None:
 
 def export_parser() -> argparse.ArgumentParser:
     """Parser of `dextouch export`."""
-    parser = _bridge_parser("export", "Write episodes or recordings for other tools.", _EXPORT_HELP)
+    parser = _bridge_parser("export")
     add = parser.add_argument
     forms = sorted([*SINGLE_FORMATS, *JOINT_FORMATS])
     add("ids", nargs="*", metavar="ID", help="default: all that match the filters")
@@ -498,7 +360,7 @@ class _Mapping(argparse.Action):
 
 def import_parser() -> argparse.ArgumentParser:
     """Parser of `dextouch import`."""
-    parser = _bridge_parser("import", "Read files of other tools into a store.", _IMPORT_HELP)
+    parser = _bridge_parser("import")
     add = parser.add_argument
     add("path", type=Path, metavar="PATH", help="file or folder to read")
     forms = ("lerobot", "mcap", "rrd")
@@ -526,7 +388,6 @@ def import_parser() -> argparse.ArgumentParser:
 
 
 def _camera_matrix(text: str) -> tuple[tuple[float, float, float], ...]:
-    """Parse FX,FY,CX,CY, for argparse."""
     try:
         fx, fy, cx, cy = map(float, text.split(","))
     except ValueError:

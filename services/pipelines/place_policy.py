@@ -1,12 +1,11 @@
 """Policy of places: it sees where objects stand, and moves as in demonstrations of such places.
 
-The start readers of a state model find the objects in the first image. The commanded motion of a
-whole take is a regression on these places and on those of the hands, so that some dozens of
-demonstrations suffice. It looks once: what happens later changes nothing.
+It looks once, by the start readers of a state model, and regresses the motion of a whole take.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -16,11 +15,9 @@ from jaxtyping import Float64
 
 from dextouch.clients import PolicyStart
 from dextouch.episodes import (
-    TRUE_ORIGINS,
     EpisodeGrid,
     EpisodeReader,
     EpisodeStore,
-    Split,
     data_hash,
     select_episodes,
 )
@@ -47,6 +44,7 @@ from services.world_model.dynamics.start_reader import StartReader
 from services.world_model.dynamics.trees import stacked
 
 KIND: Final = "place-policy"
+_IMAGINED: Final[tuple[Origin, ...]] = ("imagined",)
 _READER, _MOTION = "reader.", "motion."
 # Demonstrations of a task below which its regression is refused.
 LEAST_DEMONSTRATIONS: Final = 5
@@ -93,9 +91,8 @@ def read_places(
 ) -> Places:
     """Find the objects in the first step of an observation.
 
-    Raises:
-        UnknownNameError: no head camera, or a task that the readers do not know.
-        InvalidInputError: an image of another size.
+    Raises UnknownNameError without head camera or for an unknown task, InvalidInputError for an
+    image of another size.
     """
     if task not in config.tasks:
         raise UnknownNameError("task of the place policy", task, list(config.tasks))
@@ -248,9 +245,7 @@ class PlacePolicy:
     def act(self, observation: Observation) -> Float64[np.ndarray, "16 67"]:
         """The next 16 commanded actions, relative to the rollout's step 0; at the end, the last.
 
-        Raises:
-            InvalidInputError: `reset` was not called, or an image of another size.
-            UnknownNameError: the first observation has no head camera.
+        Raises InvalidInputError before `reset`, and as `read_places`.
         """
         start = self._start
         if start is None:
@@ -306,24 +301,12 @@ def read_demonstrations(settings: TrainPolicySettings) -> list[Demonstration]:
 
     Raises NotFoundError and ConflictError as `select_episodes`.
     """
-    recorded = [EpisodeStore(url) for url in settings.episodes]
-    generated = [EpisodeStore(url) for url in settings.imagined]
-    imagined: tuple[Origin, ...] = ("imagined",)
-    no_splits: tuple[Split, ...] = ()
-    sources = ((recorded, settings.splits, TRUE_ORIGINS), (generated, no_splits, imagined))
-    return [
-        Demonstration.of(reader, settings.image_px)
-        for stores, splits, origins in sources
-        if stores
-        for reader in select_episodes(
-            stores,
-            domain="robot",
-            tasks=settings.tasks,
-            splits=splits,
-            origins=origins,
-            needs=IMITATED,
-        )
-    ]
+    chosen = partial(select_episodes, domain="robot", tasks=settings.tasks, needs=IMITATED)
+    stores = [EpisodeStore(url) for url in settings.episodes]
+    readers = list(chosen(stores, splits=settings.splits))
+    if settings.imagined:
+        readers += chosen([EpisodeStore(url) for url in settings.imagined], origins=_IMAGINED)
+    return [Demonstration.of(reader, settings.image_px) for reader in readers]
 
 
 def train_place_policy(
@@ -331,9 +314,7 @@ def train_place_policy(
 ) -> Checkpoint:
     """Fit the motions of every task; the start readers of the state model `model` find the objects.
 
-    Raises:
-        InvalidInputError: too few takes of a task.
-        UnknownNameError: a task that the readers do not know.
+    Raises InvalidInputError for too few takes of a task, and as `read_places`.
     """
     found = read_state_checkpoint(model)
     config, readers = found.metadata.dynamics, found.dynamics.readers()

@@ -47,12 +47,7 @@ def twin(arguments: Mapping[str, str]) -> serve.Application:
 def application(
     create_app: Callable[[], FastAPI], settings: WorldServiceSettings, *, num_replicas: int
 ) -> serve.Application:
-    """A service of worlds as a deployment whose replicas share their rollouts.
-
-    Args:
-        create_app: called in each replica.
-        settings: of the service.
-        num_replicas: number of processes.
+    """A service of worlds, created in each replica, as a deployment that shares its rollouts.
 
     Raises InvalidInputError for state in memory, which each replica would have for itself.
     """

@@ -17,7 +17,7 @@ from services.alignment.retargeting import (
     warm_up,
 )
 from services.alignment.retargeting.hand_retargeter import calibrated_profile
-from services.alignment.retargeting.wrist_frame import (
+from services.alignment.retargeting.wrist import (
     calibrated_transform,
     calibration_name,
     hand_axes_check,
@@ -39,13 +39,8 @@ NUM_AXES_SAMPLES: Final = 30
 class RobotHandCheck:
     """Follows the keypoints of one hand with the robot's, one sample a call.
 
-    Args:
-        side: of the hand.
-        calibration: of the station; the wrist frame of the keypoints and the profile of the
-            person's hand are used if it has them.
-
-    Raises:
-        InvalidInputError, ShapeError: one of them is invalid.
+    Of the station's calibration, the wrist frame of the keypoints and the profile of the person's
+    hand are used if it has them. Raises InvalidInputError or ShapeError if one of them is invalid.
     """
 
     def __init__(self, side: Side, calibration: Mapping[str, Matrix]) -> None:
@@ -71,13 +66,9 @@ class RobotHandCheck:
     ) -> Mapping[str, FollowCause] | None:
         """Cause by finger of those that the robot cannot follow; None in the first second.
 
-        Args:
-            keypoints_m: [25, 3], metres, as the tracker sends them; NaN where not seen.
-            elapsed_s: since the sample before.
-
-        Raises:
-            InvalidInputError: the keypoints of a second are not a hand of this side in wrist axes.
-            ShapeError: not [25, 3].
+        Keypoints are [25, 3], in metres as the tracker sends them, NaN where not seen. Raises
+        ShapeError for others, and InvalidInputError if those of a second are not a hand of this
+        side in wrist axes.
         """
         keypoints = np.asarray(keypoints_m, dtype=np.float64)
         if self._first is not None and not self._axes_are_right(keypoints):

@@ -62,12 +62,7 @@ class BoundAddress:
 
 
 def bind(name: str, *, host: str, port: int) -> BoundAddress:
-    """Bind a port; 0 selects a free one.
-
-    Raises:
-        ConflictError: the port is in use.
-        InvalidInputError: the host is not local, or the port needs rights.
-    """
+    """Bind a port; 0 selects a free one. Raises ConflictError if it is taken (`bound_socket`)."""
     flag = f"--{name.replace('_', '-')}-port"
     advice = f"choose another port with {flag}, or 0 for any free one"
     listener = bound_socket(name, host, port, advice=advice)

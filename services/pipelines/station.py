@@ -25,9 +25,7 @@ def main(argv: Sequence[str]) -> int:
 def load_robot_check(side: Side, calibration: Mapping[str, Matrix]) -> "RobotHandCheck":
     """The check of one hand; loads the compiled solver, which takes a second, the first time more.
 
-    Raises:
-        UnavailableError: the packages of alignment are not installed.
-        InvalidInputError: the calibration has an invalid profile or wrist frame.
+    Raises UnavailableError without the packages of alignment, and as `RobotHandCheck`.
     """
     _compile_apart()
     # Collections of the many objects that it makes would hold up the readers: none while it loads,

@@ -41,15 +41,14 @@ from services.evaluation.studies.results import (
     planned_rollouts_of,
     read_definition,
 )
-from services.evaluation.studies.study_figures import REPORT_FILE, write_reports
-from services.evaluation.studies.study_pictures import write_pictures
+from services.evaluation.studies.study_figures import REPORT_FILE, write_pictures, write_reports
 from services.evaluation.success_classifier import SuccessClassifier
 from services.networks.weight_files import digest_of
 from services.pipelines.parsers import study_parser
 from services.pipelines.training_data import stage_of
-from services.twin.scripted_actions import scripted_actions
+from services.twin.stage import scripted_actions
 from services.world_model.checkpoints import is_state_checkpoint, read_state_checkpoint
-from services.world_model.shipped_checkpoints import default_checkpoint
+from services.world_model.settings import default_checkpoint
 
 # Chosen: a block opens its worlds anew, in some ten seconds, and plays all policies from these.
 _STARTS_IN_A_BLOCK = 10
@@ -119,10 +118,7 @@ def _parts(
 
 @dataclass(frozen=True)
 class _Block:
-    """Rollouts in one world from some starts of a task, for a machine of a cluster.
-
-    `definition` is the study's with these starts and this world alone.
-    """
+    """Rollouts of one world from some starts of a task, of which alone the definition is."""
 
     definition: StudyDefinition
     rollouts: tuple[PlannedRollout, ...]
@@ -137,10 +133,7 @@ def _run_on_cluster(
     store_url: str | None,
     ray_address: str,
 ) -> None:
-    """Run rollouts on the machines of a Ray cluster, which see the study's files.
-
-    Raises DexTouchError if a block of rollouts failed; those of the others are kept.
-    """
+    """Run rollouts on a Ray cluster; raises if a block of them failed, and keeps the others."""
     blocks = blocks_of(definition, missing, results.header, store_url)
     folders = [results.path.parent, *(EpisodeStore(store_url).folders if store_url else ())]
     jobs = run_jobs(run_block, blocks, Workers(ray_address=ray_address), folders=folders)
@@ -186,20 +179,13 @@ def run_block(block: _Block) -> list[Outcome]:
 
 
 def _own_paths(definition: StudyDefinition) -> list[tuple[str, Path]]:
-    """Names of worlds that have a success classifier of their own, and its file."""
     return [(name, one.probe) for name, one in definition.imagined.items() if one.probe is not None]
 
 
 def _own_probes(
     definition: StudyDefinition, probe: SuccessClassifier
 ) -> dict[str, SuccessClassifier]:
-    """Success classifiers of single worlds, by world.
-
-    Raises:
-        InvalidInputError: one does not know a task of the study, or sees images of another size
-            than `probe`.
-        NotFoundError, CorruptDataError: a checkpoint that cannot be read.
-    """
+    """Success classifiers of single worlds, by world, that fit the study's."""
     own: dict[str, SuccessClassifier] = {}
     for name, path in _own_paths(definition):
         own[name] = SuccessClassifier.load(path)
@@ -226,9 +212,8 @@ def _finish(results: StudyResults, json_path: Path | None) -> int:
 def served_worlds(definition: StudyDefinition) -> Iterator[dict[str, ServedWorld]]:
     """Addresses of all worlds by name; those without a URL are served until the block ends.
 
-    Raises:
-        UnavailableError: a process could not serve its world; its messages are above.
-        InvalidInputError: a checkpoint that cannot be served, or a key's variable is not set.
+    Raises UnavailableError if a process could not serve its world (its messages are above), and
+    InvalidInputError for a checkpoint that cannot be served, or a key's variable that is not set.
     """
     choices = {REAL: definition.real, **definition.imagined}
     with ExitStack() as children:
@@ -271,11 +256,9 @@ def connect(addresses: Mapping[str, ServedWorld], connections: ExitStack) -> Stu
 
 
 def refuse_training_seeds(definition: StudyDefinition) -> None:
-    """Refuse starts whose task and seed a world model was trained on.
+    """Refuse starts whose task and seed a world model was trained on, by ConflictError.
 
-    Raises:
-        ConflictError: a start was trained on.
-        NotFoundError: a checkpoint is missing.
+    Raises NotFoundError if a checkpoint is missing.
     """
     for name, choice in definition.imagined.items():
         path = default_checkpoint() if choice.builtin == "world-model" else choice.checkpoint
@@ -290,10 +273,9 @@ def refuse_training_seeds(definition: StudyDefinition) -> None:
 
 
 def refuse_trained(name: str, checkpoint: Path, tasks: Sequence[str], seeds: Sequence[int]) -> None:
-    """Refuse starts whose task and seed a state model was trained on.
+    """Raise ConflictError for starts whose task and seed a state model was trained on.
 
-    Content digests miss them where image size or simulator changed since. Raises ConflictError if a
-    start was trained on.
+    Content digests miss them where image size or simulator changed since.
     """
     metadata = read_state_checkpoint(checkpoint).metadata
     for task in tasks:

@@ -161,10 +161,7 @@ def _policy(choice: PolicyChoice) -> Policy:
 
 
 def _played_by(choice: PolicyChoice, stage: Stage, seed: int) -> PlayedActions:
-    """Closed-loop actions of a policy in the twin, from the start of a seed.
-
-    The twin is deterministic, so that an episode with these actions is the rollout.
-    """
+    """Actions of a policy in the twin, which is deterministic: their episode is the rollout."""
     world, policy, task = _world(), _policy(choice), stage.task
     start = RolloutStart(task=task.name, seed=seed, instruction=task.instruction)
     begun = world.reset(start)
@@ -246,12 +243,9 @@ def make_training_data(
     """Record one episode per seed, task and domain; existing episodes are kept.
 
     By default, each core records one at a time. A policy acts instead of the scripts of `mix`.
-
-    Returns:
-        Numbers of episodes `made`, `kept` and `refused` (the physics diverged, the policy failed,
-        or the take could not be aligned), and of those made, how many `succeeded`.
-
-    Raises InvalidInputError without seeds, tasks or domains, or for a policy with human hands.
+    Returns numbers of episodes `made`, `kept` and `refused` (the physics diverged, the policy
+    failed, or the take could not be aligned), and of those made, how many `succeeded`. Raises
+    InvalidInputError without seeds, tasks or domains, or for a policy with human hands.
     """
     if not seeds or not scope.tasks or not scope.domains:
         raise InvalidInputError(

@@ -50,12 +50,8 @@ class SceneViews:
     ) -> tuple[Int64[np.ndarray, "h w"], Float64[np.ndarray, "h w"]]:
         """Labels and depths (m along the optical axis, infinite for the background) of one step.
 
-        The state is rebuilt from poses and joint angles, without physics.
-
-        Args:
-            poses: measured poses of hands and head camera, and joint angles.
-            object_poses: T_world_object of every step: x y z (m), qw qx qy qz.
-            step: row of both.
+        The state is rebuilt without physics, from measured poses and joint angles and from
+        T_world_object of every step: x y z (m), qw qx qy qz.
         """
         simulation = self.stage.simulation
         simulation.pose(command_row(poses, step), object_poses[step])

@@ -1,8 +1,4 @@
-"""Cameras by ray casting, and printed markers in their images, without GPU or OpenGL.
-
-Flat object colours with Lambert shading by one light, and a chequered table that makes motion
-visible. It is deterministic: equal states give equal bytes.
-"""
+"""Deterministic cameras by ray casting, and printed markers in their images, without GPU."""
 
 import itertools
 import math
@@ -92,9 +88,8 @@ def _wrist_mount(palm_sign: float) -> Float64[np.ndarray, "4 4"]:
 class Appearance:
     """What a scene looks like besides its geometry.
 
-    `colours` are RGB 0 … 1 of every geom, `to_light` the direction to the light, `ambient` the
-    share of light from everywhere, `checker_depth` how much darker every second field of the table
-    is.
+    `colours` are RGB 0 … 1 of every geom, `ambient` the share of light from everywhere,
+    `checker_depth` how much darker every second field of the table is.
     """
 
     colours: Float64[np.ndarray, "geoms 3"]
@@ -178,10 +173,7 @@ class _Print:
 
 
 class Markers:
-    """The markers of a task's objects, drawn into images that show the scene without them.
-
-    `is_white` has the cells of every marker by its id, row by row from its upper left.
-    """
+    """Markers of a task's objects to draw into images; `is_white` has the cells of each by id."""
 
     def __init__(
         self, objects: SceneObjects, is_white: Mapping[int, Bool[np.ndarray, "n n"]]
@@ -205,13 +197,9 @@ class Markers:
         K: Float64[np.ndarray, "3 3"],
         Ts_camera_object: Float64[np.ndarray, "objects 4 4"],
     ) -> None:
-        """Draw the markers that the camera sees and nothing hides.
+        """Draw the markers that the camera (K in pixels) sees and nothing hides, into `image`.
 
-        Args:
-            image: changed.
-            range_m: distance from the camera to what each pixel shows, infinite for nothing.
-            K: of the camera, in pixels.
-            Ts_camera_object: poses of all objects.
+        `range_m` is the distance to what each pixel shows, infinite for nothing.
         """
         for one in self._prints:
             T = Ts_camera_object[one.object_index] @ one.T_object_marker
@@ -271,10 +259,7 @@ def _averaged(
 
 
 class CameraRig:
-    """The three cameras of a scene; rays are computed once and rotated with the camera.
-
-    `appearance` is what the scene looks like, `markers` those that are glued to its objects.
-    """
+    """The three cameras of a scene; rays are computed once and rotated with the camera."""
 
     def __init__(self, scene: Scene, *, height_px: int, width_px: int) -> None:
         self._model = scene.model
@@ -294,7 +279,6 @@ class CameraRig:
         self.rays = {name: self._ray_table(self.K[name]) for name in CAMERAS}
 
     def _ray_table(self, K: np.ndarray) -> Float64[np.ndarray, "rays 3"]:
-        """Unit rays of all pixel centres, row by row, in the optical frame."""
         height, width = self.shape_px
         u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
         pixels = np.stack([u.ravel(), v.ravel(), np.ones(height * width)], axis=1)
@@ -330,11 +314,7 @@ class CameraRig:
         return view.geoms.reshape(self.shape_px), depth_m.reshape(self.shape_px)
 
     def _cast(self, simulation: Simulation, camera: str) -> "_View":
-        """Find what each ray of a camera meets.
-
-        MuJoCo tests every ray against every geom. Most rays meet the top of the table or nothing,
-        which one division tells; only rays near other geoms are left to MuJoCo, with equal results.
-        """
+        """What each ray of a camera meets; MuJoCo casts those near other geoms than the table."""
         T_world_camera = self.pose(simulation, camera)
         rays = np.ascontiguousarray(self.rays[camera] @ T_world_camera[:3, :3].T)
         eye_m = np.ascontiguousarray(T_world_camera[:3, 3])
@@ -434,7 +414,6 @@ class CameraRig:
         return image
 
     def _is_dark(self, view: "_View", rays: np.ndarray) -> Bool[np.ndarray, " rays"]:
-        """Whether rays that meet the table meet one of its darker fields."""
         num_fields = np.zeros(len(rays), dtype=np.int64)
         for axis in (0, 1):
             met_m = view.eye_m[axis] + view.rays[rays, axis] * view.distances_m[rays]
@@ -459,7 +438,6 @@ class _View:
 
 
 def _visible_besides(model: mujoco.MjModel, table: int) -> Int64[np.ndarray, " geoms"]:
-    """Geoms that rays can meet, without the table."""
     is_visible = _VISIBLE_GROUPS[model.geom_group] == 1
     is_visible[table] = False
     return np.flatnonzero(is_visible)

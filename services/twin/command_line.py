@@ -40,7 +40,6 @@ class TakeReport:
 
 @lru_cache(maxsize=2)
 def _stage(task: str, domain: Domain) -> Stage:
-    """Stage of a task, compiled once per process."""
     return Stage(task, domain, TwinSettings())
 
 

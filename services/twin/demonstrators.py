@@ -1,9 +1,4 @@
-"""Scripted demonstrators: smooth commands on the model grid from waypoints of both hands.
-
-Motions off the script (retreat, push, slip, wander) start at any of its steps and are random: a
-network trained on scripts only predicts success for any similar motion, whereas their outcome must
-be learned from the state.
-"""
+"""Scripted demonstrators: smooth commands from waypoints of both hands, and other motions."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -130,10 +125,7 @@ def at_own_tempo(waypoints: Sequence[Waypoint], generator: np.random.Generator) 
 
 
 def follow(waypoints: Sequence[Waypoint], head: Float64[np.ndarray, "81 4 4"]) -> HandTrajectory:
-    """Commands of a whole take: smoothstep between waypoints, constant before and after them.
-
-    Raises InvalidInputError for times that do not increase.
-    """
+    """Commands of a take: smoothstep between waypoints at increasing times, else constant."""
     times = np.array([waypoint.time_s for waypoint in waypoints])
     if len(times) < 2 or (np.diff(times) <= 0).any():
         raise InvalidInputError(

@@ -24,8 +24,7 @@ from dextouch.tactile.layout import NUM_TAXELS, SIDES, Side
 from services.twin.demonstrators import NUM_GRID_STEPS, MotionScene, with_motion
 from services.twin.hands import HumanHand
 from services.twin.mistakes import with_mistakes
-from services.twin.mjcf import PHYSICS_RATE_HZ
-from services.twin.scene import object_boxes_m
+from services.twin.scene import PHYSICS_RATE_HZ, object_boxes_m
 from services.twin.simulation import MODEL_RATE_HZ, STEPS_PER_GRID
 from services.twin.stage import Plan, Stage, command_row
 from services.twin.take_options import PlayedActions, TakeOptions, episode_id
@@ -57,8 +56,8 @@ class TruthStream:
 class TruthEpisode:
     """Ground truth of one take.
 
-    `pad_forces_n` is the true contact force at the tactile rate: normal force on thumb … little tip
-    and palm, left then right; pressures times taxel areas sum to it.
+    `pad_forces_n` is the true normal force on thumb … little tip and palm at the tactile rate, left
+    then right; pressures times taxel areas sum to it.
     """
 
     attributes: EpisodeAttributes
@@ -69,10 +68,7 @@ class TruthEpisode:
 def record(
     stage: Stage, seed: int, options: TakeOptions, *, played: PlayedActions | None = None
 ) -> TruthEpisode:
-    """Record one take; equal stage, seed, options and actions give equal bytes.
-
-    The options determine the commands, unless actions are `played`.
-    """
+    """Record a take, deterministically; `played` actions replace those of the options."""
     sizes = options.sizes
     plan = stage.plan(
         seed, noise_m=options.noise_m, miss=options.miss, varied=options.varied, sizes=sizes
@@ -111,7 +107,6 @@ def record(
 
 
 def _note(stage: Stage, step: int, times_s: dict[str, float]) -> None:
-    """Note the milestones that are reached for the first time at a grid step."""
     reached = stage.task.reached(stage.simulation)
     for name, holds in zip(stage.task.milestones, reached, strict=True):
         if holds:
@@ -229,7 +224,6 @@ class Recorder:
 
 
 def _sources(stage: Stage, options: TakeOptions) -> list[tuple[StreamDescriptor, Source]]:
-    """The streams of a take, each with what is sampled for it."""
     simulation, rig = stage.simulation, stage.rig
     found: list[tuple[StreamDescriptor, Source]] = [
         (
@@ -341,12 +335,7 @@ class GridLog:
 
     def trajectory(self) -> HandTrajectory:
         """Trajectory of all recorded steps."""
-        Ts = transform_from_pose(np.stack(self._wrists))
-        joints = np.stack(self._joints)
-        return HandTrajectory(
-            Ts[:, 0],
-            Ts[:, 1],
-            joints[:, 0],
-            joints[:, 1],
-            transform_from_pose(np.stack(self._heads)),
-        )
+        left, right = np.swapaxes(transform_from_pose(np.stack(self._wrists)), 0, 1)
+        joints_left, joints_right = np.swapaxes(np.stack(self._joints), 0, 1)
+        head = transform_from_pose(np.stack(self._heads))
+        return HandTrajectory(left, right, joints_left, joints_right, head)

@@ -1,7 +1,4 @@
-"""Kinematic search for hand postures that hold a cylinder.
-
-The search is deterministic (with a fixed generator of its own) and cached per process and hand.
-"""
+"""Deterministic search for hand postures that hold a cylinder, cached per process and hand."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -13,8 +10,8 @@ from jaxtyping import Float64
 from dextouch.geometry import apply, transform
 from dextouch.geometry.rotations import rotation_from_vector
 from services.twin.hands import TwinHand, twin_hand
-from services.twin.mjcf import FINGER_STIFFNESS_NM_RAD
 from services.twin.names import Domain
+from services.twin.scene import FINGER_STIFFNESS_NM_RAD
 
 # Draws of the first round and of each next one, and rounds (chosen).
 _NUM_FIRST, _NUM_NEXT, _NUM_ROUNDS = 6000, 300, 45
@@ -36,11 +33,10 @@ _SHARES: Final = (1.0, 0.45, 0.30, 0.20, 0.05)
 class CylinderGrasp:
     """A cylinder in front of the palm and parallel to it, to be held by all five fingertips.
 
-    Its axis runs across the hand, rotated by `skew_rad` so that on the thumb's side it lies more
-    towards the fingertips (people hold a bottle that way, since the thumb sits far back).
-    `distance_m` is the axis' distance from the wrist origin on the palm side, `z_m` its position
-    along the fingers; fingertips touch `below_rad` beyond the middle, seen from the palm; the
-    thumb's touches at `thumb_m` along the axis. The table is `table_m` beyond the axis.
+    Its axis runs across the hand at `distance_m` from the wrist origin, `z_m` along the fingers,
+    rotated by `skew_rad` towards the fingertips on the thumb's side. Fingertips touch `below_rad`
+    beyond the middle, seen from the palm; the thumb's at `thumb_m` along the axis. The table is
+    `table_m` beyond the axis.
     """
 
     radius_m: float
@@ -133,7 +129,6 @@ def _refine(
 
 @lru_cache(maxsize=8)
 def _searched(grasp: CylinderGrasp, domain: Domain) -> Float64[np.ndarray, "20"]:
-    """Joint angles that hold the cylinder, equal for left and right hands."""
     hand = twin_hand("right", domain)
     lower, upper = hand.kinematics.lower_rad, hand.kinematics.upper_rad
     start = np.random.default_rng(10).uniform(lower, upper, size=(_NUM_FIRST, 20))
@@ -173,10 +168,9 @@ def opened(grasp: CylinderGrasp, domain: Domain, *, gap_m: float) -> Float64[np.
 
 
 def pressing(grasp: CylinderGrasp, domain: Domain, *, force_n: float) -> Float64[np.ndarray, "20"]:
-    """Servo targets that squeeze the cylinder with about `force_n`.
+    """Servo targets, perhaps beyond limits, that squeeze the cylinder with about `force_n`.
 
-    The targets are offset from the joint angles by Jᵀ f / stiffness: the thumb presses with the
-    full force, the fingers share it. Targets may exceed a joint's limit, where the joint stops.
+    They are offset by Jᵀ f / stiffness: the thumb has the full force, the fingers share it.
     """
     hand = twin_hand("right", domain)
     joints = holding(grasp, domain)

@@ -1,9 +1,8 @@
 """Robot and human hands of the twin: kinematics, collision shape and tactile skin.
 
-Both are five fingers × four hinges in the wrist frame of `dextouch.hands.robot_hand` (fingers
-along -z, thumb side +x, right palm towards +y, left palm towards -y). The human hand is the mean
-one of `dextouch.hands`; its limits are our estimates from common anatomy. The thumb's base frame is
-oriented like the robot's, so that flexion and abduction have the same meaning.
+Both are five fingers × four hinges in the wrist frame of `dextouch.hands.robot_hand`. The human
+hand is the mean one of `dextouch.hands`; its limits are our estimates from common anatomy, and its
+thumb's base frame is oriented like the robot's.
 """
 
 from collections.abc import Iterable, Sequence
@@ -59,10 +58,9 @@ _POINTS: Final = (1, 2, 3)
 
 
 class HandShape(NamedTuple):
-    """Collision shape: radii [5][3] of proximal, middle and distal capsules, centre of the palm.
+    """Collision shape: radii [5][3] of proximal, middle and distal capsules, and the palm.
 
-    `palm_z_m` and `palm_x_m` are the palm's centre in the wrist frame; `palm_face_m` is the
-    distance of its sensing face from the wrist origin.
+    `palm_x_m`, `palm_z_m` are its centre, `palm_face_m` its sensing face, from the wrist origin.
     """
 
     radii_m: tuple[tuple[float, float, float], ...]

@@ -1,9 +1,7 @@
 """Mistakes of demonstrators and policies: changes of the commands of a whole take.
 
-An evaluator must be right about mistakes of every kind. Its training data therefore contain many
-(`TRAINING`), others guide its development (`DEVELOPMENT`), and it is measured on those that nothing
-was trained or chosen on (`HELD_OUT`). Every kind has a size that grows with its strength, 0 … 1;
-directions, signs and times are drawn.
+Evaluators are trained on the kinds of `TRAINING`, developed on those of `DEVELOPMENT`, measured on
+those of `HELD_OUT`. Each has a size that grows with its strength, 0 … 1; the rest is drawn.
 """
 
 import re
@@ -51,12 +49,7 @@ class Mistake:
 
     @classmethod
     def parse(cls, text: str) -> "Mistake":
-        """A mistake from KIND=STRENGTH.
-
-        Raises:
-            InvalidInputError: other text, or a strength outside 0 … 1.
-            UnknownNameError: no such kind.
-        """
+        """A mistake from KIND=STRENGTH; raises InvalidInputError or UnknownNameError."""
         match = _FORM.fullmatch(text)
         if match is None:
             raise InvalidInputError(f"mistake: got {text!r}, expected KIND=STRENGTH, 0 … 1")
@@ -69,10 +62,7 @@ class Mistake:
 def with_mistakes(
     commands: HandTrajectory, mistakes: Sequence[Mistake], scene: MotionScene, seed: int
 ) -> HandTrajectory:
-    """Commands with all mistakes, in their order; equal arguments give equal commands.
-
-    The first command and the motion of the head stay as they are.
-    """
+    """Commands with all mistakes in order, deterministic; the first command and the head stay."""
     for mistake in mistakes:
         kind = zlib.crc32(mistake.kind.encode())
         draw = np.random.default_rng([seed, _STREAM, kind])
@@ -239,8 +229,8 @@ def _tempo(take: _Take, strength: float, draw: Draw) -> HandTrajectory:
 
 def _pause(take: _Take, strength: float, draw: Draw) -> HandTrajectory:
     first, length = draw.uniform(5, 60), 2.0 * MODEL_RATE_HZ * strength
-    waited = np.clip(_STEPS - first, 0, length)
-    return take.at(_both(_STEPS - waited))
+    delay = np.clip(_STEPS - first, 0, length)
+    return take.at(_both(_STEPS - delay))
 
 
 def _finger_time(take: _Take, strength: float, draw: Draw) -> HandTrajectory:

@@ -1,12 +1,11 @@
-"""Compiled MuJoCo model of a scene: addresses of hands and objects, and the sizes of objects.
+"""MuJoCo model of a scene: its MJCF, addresses of hands and objects, sizes of objects.
 
-A free object is a child of the world with a free joint. Any other is attached to a mocap body, a
-static child of the world: it is that body itself (a stand, a cabinet), or a descendant with hinge
-or slide joints in between (a door, a drawer). Mocap poses are part of the physics state, so states
-and snapshots contain the poses of fixed objects.
+An object is free, a child of the world with a free joint, or fixed: a mocap body (a stand, a
+cabinet), or a part of one on hinges or slides (a door, a drawer). Mocap poses are part of the
+physics state, and so of snapshots.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Final
@@ -19,9 +18,8 @@ from jaxtyping import Bool, Float64, Int64
 from dextouch.errors import InvalidInputError
 from dextouch.geometry import apply, invert, pose_from_transform, transform, transform_from_pose
 from dextouch.geometry.rotations import vector_from_rotation
-from dextouch.tactile.layout import SIDES
-from services.twin.hands import TwinHand, twin_hand
-from services.twin.mjcf import scene_xml
+from dextouch.tactile.layout import FINGERS, SIDES
+from services.twin.hands import PALM_THICKNESS_M, TwinHand, twin_hand
 from services.twin.names import Domain
 
 logger = structlog.get_logger(__name__)
@@ -49,6 +47,16 @@ _DRAWN: Final = {"width": (0.75, 1.30), "height": (0.90, 1.10)}
 # Fields of a model that depend on the size of a geom.
 _GEOMETRY: Final = ("geom_size", "geom_pos", "geom_rbound", "geom_aabb", "bvh_aabb")
 _ROUND: Final = {int(mujoco.mjtGeom.mjGEOM_CYLINDER), int(mujoco.mjtGeom.mjGEOM_CAPSULE)}
+PHYSICS_RATE_HZ = 600  # a multiple of the rates of all devices
+# Wrist impedance of the arm (or the operator's arm) towards the commanded pose.
+WRIST_STIFFNESS_N_M, WRIST_DAMPING_N_S_M = 700.0, 40.0
+WRIST_STIFFNESS_NM_RAD, WRIST_DAMPING_NM_S_RAD = 15.0, 0.4
+FINGER_STIFFNESS_NM_RAD, FINGER_DAMPING_NM_S_RAD, FINGER_TORQUE_NM = 1.2, 0.03, 2.0
+# Human skin and the robot's pads yield about 1 mm at 10 N.
+_HAND_CONTACT = 'friction="1.2 0.01 0.0005" solref="0.02 1" solimp="0.4 0.8 0.004" priority="1"'
+_OBJECT_CONTACT = 'friction="1 0.005 0.0001"'
+_HAND_COLOURS = {"left": (0.45, 0.62, 0.88), "right": (0.90, 0.66, 0.50)}
+_SKIN_GROUP = 4
 
 
 def _log_warning(text: str) -> None:
@@ -60,11 +68,7 @@ mujoco.set_mju_user_warning(_log_warning)
 
 
 class ObjectBodies:
-    """Access to poses and speeds of a task's objects in MuJoCo's arrays.
-
-    Raises InvalidInputError for a name without a body, or a body that is neither free nor attached
-    to a mocap body by hinges and slides.
-    """
+    """Poses and speeds of objects; raises InvalidInputError for one neither free nor fixed."""
 
     def __init__(self, model: mujoco.MjModel, names: tuple[str, ...]) -> None:
         self._model = model
@@ -88,7 +92,6 @@ class ObjectBodies:
         self.of_body = self._nearest_object()
 
     def _chain(self, body: int) -> list[int]:
-        """A body and its ancestors up to the child of the world."""
         if body < 0:
             raise InvalidInputError(
                 f"twin scene: got objects {self._names}, expected names of bodies"
@@ -121,7 +124,6 @@ class ObjectBodies:
         return np.concatenate(spans).astype(np.int64)
 
     def _rest_poses(self, roots: list[int]) -> Float64[np.ndarray, "objects 4 4"]:
-        """T_root_object with all joints at rest."""
         data = mujoco.MjData(self._model)
         mujoco.mj_kinematics(self._model, data)
         pairs = zip(roots, self.ids.tolist(), strict=True)
@@ -138,10 +140,7 @@ class ObjectBodies:
         return owner
 
     def place(self, data: mujoco.MjData, poses: Float64[np.ndarray, "objects 7"]) -> None:
-        """Set the pose of every object; joints of fixed objects keep their rest position.
-
-        Raises InvalidInputError for contradictory poses of the parts of a fixed object.
-        """
+        """Set all poses, joints at rest; raises InvalidInputError for contradictory parts."""
         data.qpos[self._free_qpos] = poses[self.is_free]
         placed: dict[int, np.ndarray] = {}
         for index in np.flatnonzero(~self.is_free):
@@ -169,11 +168,7 @@ class ObjectBodies:
         return poses
 
     def restore(self, data: mujoco.MjData, poses: Float64[np.ndarray, "objects 7"]) -> None:
-        """Set the pose of every object, with joints where they must be for it.
-
-        Raises:
-            InvalidInputError: an object on several joints, or on a body that is no object itself.
-        """
+        """Set all poses, joints as needed; raises InvalidInputError where that is not unique."""
         data.qpos[self._free_qpos] = poses[self.is_free]
         Ts = transform_from_pose(poses)
         roots: dict[int, np.ndarray] = {}
@@ -279,10 +274,7 @@ def compile_scene(domain: Domain, *, objects: str, object_names: tuple[str, ...]
 
 
 def object_boxes_m(scene: Scene) -> Float64[np.ndarray, "objects 6"]:
-    """Centre x y z and half sizes x y z of each object's box in its own frame (m).
-
-    Unnamed parts of an object are included with their joints at rest; meshes by their hull.
-    """
+    """Centre and half sizes x y z of each object's box in its frame (m), parts at rest included."""
     data = mujoco.MjData(scene.model)
     mujoco.mj_kinematics(scene.model, data)
     boxes = np.zeros((len(scene.object_names), 6))
@@ -304,7 +296,6 @@ def _span(
     geom: int,
     T_object_world: Float64[np.ndarray, "4 4"],
 ) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]:
-    """Minimum and maximum coordinates of a geom in its object's frame."""
     R_world_geom = data.geom_xmat[geom].reshape(3, 3)
     T = T_object_world @ transform(R_world_geom, data.geom_xpos[geom])
     kind = int(model.geom_type[geom])
@@ -319,10 +310,9 @@ def _span(
 
 @dataclass(frozen=True)
 class Sizes:
-    """Factors of the usual size of all objects that hands can carry, in the objects' frames.
+    """Factors of the usual size of all objects that hands can carry; masses stay.
 
-    `width` is along x and y and `height` along z, the axis of round objects. Masses stay, and fixed
-    objects keep their size.
+    `width` is along x and y of the objects' frames and `height` along z, the axis of round objects.
     """
 
     width: float = 1.0
@@ -368,11 +358,7 @@ class Geometry:
         self._bodies = np.flatnonzero(np.isin(scene.bodies.of_body, free))
 
     def resize(self, sizes: Sizes) -> None:
-        """Give objects their sizes of a take, from the usual ones.
-
-        Geoms that are turned in their object grow along each of their own axes as the object does
-        along it.
-        """
+        """Give objects their sizes of a take; turned geoms grow along their own axes."""
         model = self._scene.model
         for name, values in self._usual.items():
             getattr(model, name)[:] = values
@@ -397,11 +383,7 @@ class Geometry:
     def on_the_same_level(
         self, poses: Float64[np.ndarray, "objects 7"], sizes: Sizes, boxes_m: np.ndarray
     ) -> Float64[np.ndarray, "objects 7"]:
-        """Poses with the lowest point of every resized object where it was before.
-
-        Poses are planned for the usual sizes; `boxes_m` are middle and half sizes of the usual
-        boxes in the objects' frames.
-        """
+        """Poses that keep the lowest point of each resized object, usually `boxes_m`."""
         placed = np.array(poses)
         up = transform_from_pose(placed)[:, 2, :3]
         low_m = [
@@ -410,3 +392,141 @@ class Geometry:
         ]
         placed[:, 2] += np.where(self._scene.bodies.is_free, low_m[0] - low_m[1], 0.0)
         return placed
+
+
+def numbers(values: Iterable[float]) -> str:
+    """Format numbers as an MJCF attribute, without loss."""
+    return " ".join(repr(float(value)) for value in values)
+
+
+def _tint(side: str, finger_index: int) -> str:
+    base = np.array(_HAND_COLOURS[side])
+    return numbers([*(base * (0.80 + 0.06 * finger_index)).clip(0, 1), 1.0])
+
+
+def _finger(hand: TwinHand, index: int) -> str:
+    table = hand.kinematics.fingers[index]
+    straight_m, _ = hand.distal_m(index)
+    tip = np.array(table.tip_m)
+    ends = [
+        np.zeros(3),
+        np.array(table.joints[2].position_m),
+        np.array(table.joints[3].position_m),
+        tip / np.linalg.norm(tip) * straight_m,
+    ]
+    prefix = f"{hand.side}_{FINGERS[index]}"
+    rgba = _tint(hand.side, index)
+    parts = []
+    for link, row in enumerate(table.joints):
+        parts.append(
+            f'<body name="{prefix}_{link}" pos="{numbers(row.position_m)}" '
+            f'quat="{numbers(row.q_wxyz)}" gravcomp="1"><joint name="{row.name}" class="finger" '
+            f'axis="{numbers(row.axis)}" range="{numbers(row.limits_rad)}"/>'
+        )
+        if link == 0:
+            parts.append('<inertial mass="0.01" pos="0 0 0" diaginertia="1e-6 1e-6 1e-6"/>')
+        else:
+            radius = hand.shape.radii_m[index][link - 1]
+            parts.append(
+                f'<geom name="{prefix}_link{link}" class="hand" type="capsule" '
+                f'fromto="0 0 0 {numbers(ends[link])}" size="{radius!r}" rgba="{rgba}"/>'
+            )
+    parts.append(_skin(f"{prefix}_skin"))
+    return "".join(parts) + "</body>" * len(table.joints)
+
+
+def _skin(name: str) -> str:
+    return (
+        f'<geom name="{name}" type="mesh" mesh="{name}" contype="0" conaffinity="0" mass="0" '
+        f'group="{_SKIN_GROUP}" rgba="0 0 0 0"/>'
+    )
+
+
+def _hand(hand: TwinHand) -> str:
+    side, shape = hand.side, hand.shape
+    half = (0.040, 0.5 * PALM_THICKNESS_M, 0.045)
+    centre = hand.palm_centre_m - np.array([0.0, hand.palm_sign * half[1], 0.0])
+    fingers = "".join(_finger(hand, index) for index in range(len(FINGERS)))
+    forearm_z = shape.palm_z_m + half[2]
+    return (
+        f'<body name="{side}_wrist" gravcomp="1"><freejoint name="{side}_free"/>'
+        '<inertial mass="0.45" pos="0 0 -0.03" diaginertia="8e-4 1e-3 6e-4"/>'
+        f'<geom name="{side}_palm" class="hand" type="box" pos="{numbers(centre)}" '
+        f'size="{numbers(half)}" rgba="{_tint(side, 1)}"/>'
+        f'<geom name="{side}_forearm" class="hand" type="capsule" size="0.026" '
+        f'fromto="0 0 {forearm_z + 0.02!r} 0 0 {forearm_z + 0.06!r}" '
+        f'contype="0" conaffinity="0" mass="0" rgba="{_tint(side, 0)}"/>'
+        f'<site name="{side}_wrist_site"/>{_skin(f"{side}_palm_skin")}{fingers}</body>'
+        f'<body name="{side}_target" mocap="true"><site name="{side}_target_site"/></body>'
+    )
+
+
+def _grid_mesh(name: str, grid_m: np.ndarray, *, flip: bool) -> str:
+    """Mesh of an open surface through a grid of points [rows, columns, 3]."""
+    rows, columns, _ = grid_m.shape
+    index = np.arange(rows * columns).reshape(rows, columns)
+    a, b = index[:-1, :-1].ravel(), index[:-1, 1:].ravel()
+    c, d = index[1:, :-1].ravel(), index[1:, 1:].ravel()
+    triangles = np.concatenate([np.stack([a, c, b], -1), np.stack([b, c, d], -1)])
+    if flip:
+        triangles = triangles[:, ::-1]
+    faces = " ".join(str(int(corner)) for corner in triangles.ravel())
+    return (
+        f'<mesh name="{name}" inertia="shell" vertex="{numbers(grid_m.ravel())}" face="{faces}"/>'
+    )
+
+
+def _meshes(hand: TwinHand) -> str:
+    flip = hand.side == "left"
+    tips = [
+        _grid_mesh(f"{hand.side}_{finger}_skin", hand.tip_skin_m(index), flip=flip)
+        for index, finger in enumerate(FINGERS)
+    ]
+    return "".join(tips) + _grid_mesh(f"{hand.side}_palm_skin", hand.palm_skin_m(), flip=flip)
+
+
+def _actuators(hand: TwinHand) -> str:
+    parts = [
+        f'<position name="{name}" joint="{name}" kp="{FINGER_STIFFNESS_NM_RAD}" '
+        f'kv="{FINGER_DAMPING_NM_S_RAD}" forcerange="-{FINGER_TORQUE_NM} {FINGER_TORQUE_NM}"/>'
+        for name in hand.kinematics.joint_names
+    ]
+    for axis in range(6):
+        gear = " ".join("1" if axis == position else "0" for position in range(6))
+        stiffness = WRIST_STIFFNESS_N_M if axis < 3 else WRIST_STIFFNESS_NM_RAD
+        damping = WRIST_DAMPING_N_S_M if axis < 3 else WRIST_DAMPING_NM_S_RAD
+        parts.append(
+            f'<position name="{hand.side}_wrist_{axis}" site="{hand.side}_wrist_site" '
+            f'refsite="{hand.side}_target_site" gear="{gear}" kp="{stiffness}" kv="{damping}"/>'
+        )
+    return "".join(parts)
+
+
+def _sensors(hand: TwinHand) -> str:
+    return "".join(
+        f'<tactile name="{hand.side}_{pad}" geom="{hand.side}_{pad}_skin" '
+        f'mesh="{hand.side}_{pad}_skin"/>'
+        for pad in (*FINGERS, "palm")
+    )
+
+
+def scene_xml(hands: tuple[TwinHand, ...], objects: str) -> str:
+    """MJCF of table, shelf behind the viewer, hands (left first) and bodies of class "object"."""
+    bodies = "".join(_hand(hand) for hand in hands)
+    return (
+        '<mujoco model="dextouch_twin"><compiler angle="radian" autolimits="true"/>'
+        f'<option timestep="{1 / PHYSICS_RATE_HZ!r}" cone="elliptic" impratio="10" '
+        'integrator="implicitfast" solver="Newton"><flag autoreset="disable"/></option>'
+        '<size memory="64M"/>'
+        '<default><default class="hand"><geom contype="1" conaffinity="2" density="1100" '
+        f'condim="4" {_HAND_CONTACT}/></default>'
+        f'<default class="object"><geom contype="2" conaffinity="3" condim="4" {_OBJECT_CONTACT}/>'
+        '</default><default class="finger"><joint type="hinge" armature="0.0005" damping="0.01"/>'
+        f"</default></default><asset>{''.join(_meshes(hand) for hand in hands)}</asset><worldbody>"
+        '<geom name="table" class="object" type="box" pos="0 0 -0.02" size="0.7 0.5 0.02" '
+        'rgba="0.72 0.66 0.58 1"/>'
+        '<geom name="shelf" class="object" type="box" pos="0 -3 -0.02" size="0.7 0.5 0.02"/>'
+        f'<body name="head_target" mocap="true"/>{bodies}{objects}</worldbody>'
+        f"<actuator>{''.join(_actuators(hand) for hand in hands)}</actuator>"
+        f"<sensor>{''.join(_sensors(hand) for hand in hands)}</sensor></mujoco>"
+    )

@@ -1,12 +1,8 @@
 """Running simulation of a scene: commands on the model grid, physics, contacts and poses.
 
-Scripted demonstrators and policies both use `Simulation.advance`, so they share physics and
-interpolation of commands.
-
-Touch: MuJoCo's tactile sensor gives the penetration depth of each taxel, hence the *pattern*; the
-contact solver gives the force on each pad, hence the *magnitude*. Depths are converted to pressures
-of an elastic layer that integrate to the pad's force; if a pad is pressed without any taxel
-penetrating, the force goes to the taxel nearest to each contact.
+Touch: the depths of MuJoCo's tactile sensor are the *pattern*, the forces of the contact solver
+on each pad the *magnitude* of the pressures of an elastic layer. If no taxel of a pressed pad has
+a depth, the force goes to the taxel nearest to each contact.
 """
 
 from collections.abc import Iterator
@@ -18,9 +14,8 @@ from jaxtyping import Bool, Float32, Float64, Int64
 
 from dextouch.errors import InvalidInputError
 from dextouch.geometry import interpolate_poses, pose_from_transform, transform_from_pose
-from dextouch.tactile.layout import FINGERS, NUM_TAXELS, SIDES, taxel_areas_m2
-from services.twin.mjcf import PHYSICS_RATE_HZ
-from services.twin.scene import Scene
+from dextouch.tactile.layout import DEXTOUCH_V1, FINGERS, NUM_TAXELS, SIDES
+from services.twin.scene import PHYSICS_RATE_HZ, Scene
 
 MODEL_RATE_HZ = 15  # as in the paper
 STEPS_PER_GRID = PHYSICS_RATE_HZ // MODEL_RATE_HZ
@@ -65,10 +60,7 @@ class Simulation:
     def place(
         self, command: Command, object_poses: Float64[np.ndarray, "objects 7"], *, settle_s: float
     ) -> None:
-        """Set hands and objects, let objects settle, and restart at step 0.
-
-        The hands rest exactly at the command, so measured equals commanded at the start.
-        """
+        """Set hands, exactly at the command, and objects, let these settle, restart at step 0."""
         mujoco.mj_resetData(self.scene.model, self.data)
         self._apply(pose_from_transform(command.Ts_world_x), command.joints_rad)
         self._bodies.place(self.data, object_poses)
@@ -100,9 +92,8 @@ class Simulation:
     def advance(self, target: Command) -> Iterator[int]:
         """Simulate one grid interval, moving the command linearly to `target`.
 
-        Yields the index of every physics step; poses are current at each step, everything else
-        (skin, cameras, contacts) at steps divisible by STEPS_PER_TACTILE. Raises InvalidInputError
-        if the physics diverged.
+        Yields the index of every physics step; only poses are current at each, all else at steps
+        divisible by STEPS_PER_TACTILE. Raises InvalidInputError if the physics diverged.
         """
         poses, joints_rad = self._interpolated(target)
         for pose, joints in zip(poses, joints_rad, strict=True):
@@ -134,7 +125,6 @@ class Simulation:
         return pose_from_transform(Ts.reshape(-1, parts, 4, 4).swapaxes(0, 1)), joints
 
     def _sense(self) -> None:
-        """Update all derived quantities and read the tactile sensors."""
         option = self.scene.model.opt
         option.disableflags &= ~_NO_SENSORS
         mujoco.mj_forward(self.scene.model, self.data)
@@ -239,7 +229,7 @@ class TactileReader:
 
     def __init__(self, scene: Scene) -> None:
         self._model = scene.model
-        self._areas_m2 = taxel_areas_m2()
+        self._areas_m2 = DEXTOUCH_V1.areas_m2
         self._pads: list[_Pad] = []
         self._pad_of_geom = np.full(scene.model.ngeom, -1, dtype=np.int64)
         for side_index, side in enumerate(SIDES):
@@ -274,10 +264,7 @@ class TactileReader:
     def read(
         self, data: mujoco.MjData
     ) -> tuple[Float32[np.ndarray, "2 320"], Float64[np.ndarray, "2 6"]]:
-        """Pressures (kPa) and pad forces (N: five tips, palm), left then right.
-
-        `data` must be consistent (after `mj_forward` with sensors enabled).
-        """
+        """Pressures (kPa) and pad forces (N: tips, palm), left, right, after `mj_forward`."""
         forces_n = np.zeros((len(SIDES), NUM_TAXELS))
         pad_forces_n = np.zeros((len(SIDES), len(FINGERS) + 1))
         pressed = self._pad_of_geom[data.contact.geom[: data.ncon]].max(axis=1)
@@ -292,7 +279,6 @@ class TactileReader:
     def _spread(
         self, data: mujoco.MjData, pad: _Pad, contacts: Int64[np.ndarray, " contacts"]
     ) -> Float64[np.ndarray, " taxels"]:
-        """Distribute the normal force of a pad's contacts to its taxels."""
         offsets = self._skin_world_m(data, pad)[None] - data.contact.pos[contacts][:, None]
         distances = np.linalg.norm(offsets, axis=2)
         nearest = distances.argmin(axis=1)
@@ -316,15 +302,10 @@ class TactileReader:
 def elastic_layer(
     depths_m: Float64[np.ndarray, " taxels"], force_n: float, stiffness_n_m: float
 ) -> Float64[np.ndarray, " taxels"]:
-    """Forces of an elastic layer at depths that are known up to a common offset c.
+    """Forces, of sum F, of an elastic layer at depths that are known up to a common offset c.
 
-    Solves Σ k max(0, depth - c) = F over the touched taxels, c at most MAX_RELIEF_M, and scales
-    the result so that it sums to F.
-
-    Args:
-        depths_m: 0 or more, at least one of them positive.
-        force_n: sum of the forces.
-        stiffness_n_m: stiffness of one taxel.
+    Solves Σ k max(0, depth - c) = F over the touched taxels, c at most MAX_RELIEF_M; depths are 0
+    or more, one of them positive, k is the stiffness of one taxel.
     """
     touched = depths_m > 0.0
     deepest_first = np.sort(depths_m[touched])[::-1]

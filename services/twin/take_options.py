@@ -45,14 +45,12 @@ class TakeOptions:
 
     `noise_m` is the demonstrator's error (0 … 0.2 m), `miss` moves or removes the objects while the
     motion stays, `images` are the cameras to record. At most one of three modifies the commands:
-    `frozen_from_step` (0 … 80) freezes them from that step on (0: from the start), `motion`
-    replaces the script, and `actions_of_seed` plays the demonstration of another seed, relative to
-    this take's start. `mistakes` change the commands of the script, in their order.
-
-    With `varied`, colours, light and the home of the head camera differ from take to take; `sizes`
-    are those of the objects, unknown to the demonstrator. Cameras record at 30 Hz, or at grid steps
-    that are multiples of `image_every` and the last three. With `training`, only touch, images,
-    actions, and object poses at grid steps are recorded.
+    `frozen_from_step` (0 … 80) freezes them from that step on, `motion` replaces the script, and
+    `actions_of_seed` plays the demonstration of another seed, relative to this take's start.
+    `mistakes` change the commands of the script, in their order; with `varied`, colours, light and
+    the home of the head camera differ from take to take. Cameras record at 30 Hz, or at grid steps
+    that are multiples of `image_every` and the last three; with `training` streams, only touch,
+    images, actions, and object poses at grid steps are recorded.
     """
 
     noise_m: float = 0.0
@@ -134,10 +132,9 @@ class TakeOptions:
 
 @dataclass(frozen=True)
 class PlayedActions:
-    """Commands of a take from another source, such as a policy.
+    """Commands of a take, relative to its start, row 0 being its pose, from another source.
 
-    `actions` are relative to the take's start, row 0 being its pose; `name` becomes part of the
-    episode's id, and `command` is the command that reproduces the episode.
+    `name` becomes part of the episode's id; `command` is the command that reproduces the episode.
     """
 
     name: str
@@ -189,10 +186,8 @@ class Mix:
     Scripts: `exact`, with noise of up to 12 (`fine`), 25 (`medium`) or 40 mm (`coarse`) standard
     deviation, or with the levels `LADDER_M` cycled over the seeds (`ladder`). The other kinds have
     the noise of a script: `miss` has displaced objects; `frozen` stops midway and `hold` never
-    starts; `retreat`, `push`, `slip` and `wander` are motions of `services.twin.demonstrators`;
-    `other_scene` plays the actions of another seed; `mistaken` has one to four of the mistakes
-    `services.twin.mistakes.TRAINING`, two of five in a script that is also noisy;
-    `otherwise_mistaken` has one of the kinds `services.twin.mistakes.DEVELOPMENT`.
+    starts; the `MOTION_KINDS`; `other_scene` plays the actions of another seed; `mistaken` has one
+    to four mistakes of `TRAINING`, `otherwise_mistaken` one of `DEVELOPMENT`.
     """
 
     exact: float = 0.0
@@ -227,10 +222,7 @@ class Mix:
             )
 
     def changed(self, *, miss: float | None = None, still: float | None = None) -> "Mix":
-        """Copy with another share of misses, or of takes that stop (half) or never start.
-
-        Raises InvalidInputError for shares outside 0 … 1, or none left for other kinds.
-        """
+        """Copy with another share, 0 … 1, of misses, or of takes that stop or never start."""
         given = {} if miss is None else {"miss": miss}
         if still is not None:
             given |= {"frozen": 0.5 * still, "hold": 0.5 * still}
@@ -258,10 +250,7 @@ MIXES: Final[dict[str, Mix]] = {
 
 
 def options_of(task: str, seed: int, mix: Mix) -> TakeOptions:
-    """Options of the take of a task and seed; deterministic.
-
-    Raises InvalidInputError for a negative seed.
-    """
+    """Options of the take of a task and a seed, 0 or more; deterministic."""
     if seed < 0:
         raise InvalidInputError(f"training data: got seed {seed}, expected 0 or more")
     draw = np.random.default_rng([seed, zlib.crc32(task.encode())])

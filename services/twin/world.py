@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from importlib.metadata import version
 from typing import Any, Final, Literal
@@ -48,10 +48,10 @@ class TwinState:
 class TwinWorld:
     """Reference world of the platform, in place of a real robot.
 
-    A rollout starts from task and seed, at the first observation of the demonstration of that seed;
-    replaying a demonstration's `action_commanded` reproduces it exactly. Measured actions are
-    treated as commands. The physics has no noise, so the seed of a step has no effect. Raises
-    UnknownNameError for an unknown camera.
+    A rollout starts at the first observation of the demonstration of a task and seed; replaying its
+    `action_commanded` reproduces it exactly. Measured actions are treated as commands. The physics
+    has
+    no noise, so the seed of a step has no effect. Raises UnknownNameError for an unknown camera.
     """
 
     def __init__(self, settings: TwinSettings) -> None:
@@ -117,10 +117,7 @@ class TwinWorld:
         seed: int,
         selector: ReturnSelector = EVERYTHING,
     ) -> SteppedRollout[TwinState]:
-        """See `World`; wrists, fingers and head follow the actions.
-
-        Reports which milestones of the task a step of the chunk reached.
-        """
+        """See `World`; hands and head follow the actions. Reports milestones reached."""
         del seed
         commands = poses_from_actions(actions, state.anchor, where="world twin: actions")
         stage = self.stage(state.task)
@@ -136,13 +133,8 @@ class TwinWorld:
             reached.update((name, 1.0) for name, holds in held if holds)
             if selector.steps == "all" or row == len(actions) - 1:
                 log.draw()
-        after = TwinState(
-            state.task,
-            state.seed,
-            state.step + len(actions),
-            stage.simulation.state(),
-            state.anchor,
-        )
+        physics = stage.simulation.state()
+        after = replace(state, step=state.step + len(actions), physics=physics)
         seen = log.observation(state.step + 1, state.anchor, steps=selector.steps)
         info = {MILESTONE_PREFIX + name: value for name, value in reached.items()}
         return SteppedRollout(after, seen, info)
@@ -190,8 +182,6 @@ class TwinWorld:
 
 
 class _StepLog:
-    """Collects the observation of consecutive grid steps of a stage."""
-
     def __init__(self, stage: Stage, cameras: tuple[str, ...]) -> None:
         self._stage = stage
         self._grid = GridLog(stage)
@@ -239,10 +229,7 @@ def twin_worlds(scene: TwinSettings) -> dict[str, World[Any]]:
 
 
 def serve(arguments: list[str]) -> None:
-    """Serve both over HTTP until SIGINT or SIGTERM.
-
-    Raises InvalidInputError for invalid settings.
-    """
+    """Serve both over HTTP until SIGINT or SIGTERM; raises InvalidInputError for bad settings."""
     load = partial(load_settings, TwinServiceSettings, arguments)
     settings = load()
     serve_worlds(partial(twin_worlds, settings.scene), settings, name="twin", load=load)

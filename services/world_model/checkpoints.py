@@ -32,14 +32,13 @@ from services.networks.weight_files import (
 from services.world_model.dynamics.features import DynamicsConfig
 from services.world_model.dynamics.model import DynamicsModel
 from services.world_model.network.configuration import (
-    GloveNetworkConfig,
     NetworkConfig,
+    RendererConfig,
     TokenizerName,
 )
 from services.world_model.network.model import JointWorldModel
 from services.world_model.network.tactile import TactileTokenizer, build_tokenizer
-from services.world_model.rendering.configuration import RendererConfig
-from services.world_model.rendering.network import RendererNetwork
+from services.world_model.rendering.renderer import RendererNetwork
 
 METADATA_KEY = "dextouch_world_model"
 _STATE_KEY = "dextouch_state_model"
@@ -88,7 +87,7 @@ class CheckpointMetadata(FrozenModel):
 
     format_version: int = 1
     name: str
-    network: GloveNetworkConfig | NetworkConfig
+    network: NetworkConfig
     tasks: tuple[str, ...]
     command: str
     seed: int
@@ -130,11 +129,7 @@ def dropout_shares(text: float, action: float, ancestor: Checkpoint | None) -> t
 
 
 def write_checkpoint(path: Path, model: JointWorldModel, metadata: CheckpointMetadata) -> str:
-    """Write the file atomically and return its digest.
-
-    The full size keeps the precision of its weights, and comes with the text features of its
-    instructions, so that the text encoder is not needed to serve them.
-    """
+    """Write the file atomically and return its digest; the full size with its text features."""
     if model.text_features is None:
         return write_weights(path, half_weights(model), metadata, METADATA_KEY)
     known = model.text_features.known
@@ -183,11 +178,7 @@ def _default_limit(path: Path) -> int:
 
 
 def read_metadata(path: Path) -> CheckpointMetadata:
-    """Metadata of a checkpoint, without reading its weights.
-
-    Raises:
-        NotFoundError, CorruptDataError, InvalidInputError: as `read_weights`.
-    """
+    """Metadata of a checkpoint without its weights; raises as `read_history`."""
     return read_history(path, CheckpointMetadata, METADATA_KEY)
 
 
@@ -197,11 +188,10 @@ def list_checkpoints(folder: Path) -> dict[Path, str]:
 
 
 class StateBounds(FrozenModel):
-    """Limits beyond which a rollout is flagged as uncertain.
+    """Limits beyond which a rollout is flagged as uncertain, high quantiles over held-out episodes.
 
-    `disagreement_m` and `distance` are high quantiles over held-out episodes; `horizon_latents` is
-    the length of training episodes. Bounds `of_chunks` apply to the worst latent step of any 16
-    steps; those of older checkpoints to an episode's worst disagreement and mean distance.
+    Bounds `of_chunks` apply to the worst latent step of any 16 steps; those of older checkpoints to
+    an episode's worst disagreement and mean distance.
     """
 
     disagreement_m: float = Field(default=1.0, ge=0, allow_inf_nan=False)
@@ -211,10 +201,7 @@ class StateBounds(FrozenModel):
 
     @property
     def latent_distance(self) -> float:
-        """Largest distance at which a latent step is not flagged.
-
-        No step exceeds a bound on the mean over an episode times the number of steps.
-        """
+        """Largest distance at which a latent step is not flagged, from the mean over an episode."""
         return self.distance * (1 if self.of_chunks else self.horizon_latents)
 
 
@@ -317,8 +304,7 @@ def read_state_checkpoint(path: Path) -> StateCheckpoint:
     """Load a state model strictly, in float32 and evaluation mode.
 
     Raises:
-        NotFoundError, LimitExceededError, CorruptDataError, NonFiniteError: as `read_weights`.
-        InvalidInputError: unsupported format version; missing or unexpected tensors, wrong shapes.
+        The errors of `read_checkpoint`.
     """
     tensors, metadata, digest = read_weights(path, StateMetadata, _STATE_KEY)
     dynamics = DynamicsModel(metadata.dynamics, metadata.num_members)
@@ -340,12 +326,7 @@ class Reconstruction(FrozenModel):
 
 
 class TokenizerMetadata(FrozenModel):
-    """Provenance and measured accuracy of a tokenizer.
-
-    `train_scenes` are the scenes of the episodes trained on (`dextouch.episodes.scene_of`). `curve`
-    begins with the untrained network and ends with the stored one. `layout` is that of the taxels,
-    None of `dextouch_v1`.
-    """
+    """Provenance and accuracy of a tokenizer; `curve` is from the untrained to the stored one."""
 
     format_version: int = 1
     tokenizer: TokenizerName
@@ -404,8 +385,7 @@ def read_tokenizer(path: Path) -> StoredTokenizer:
     """Load a tokenizer strictly, in float32 and evaluation mode, with one token per hand.
 
     Raises:
-        NotFoundError, LimitExceededError, CorruptDataError, NonFiniteError: as `read_weights`.
-        InvalidInputError: unsupported format version; missing or unexpected tensors, wrong shapes.
+        The errors of `read_checkpoint`.
     """
     tensors, metadata, digest = read_weights(path, TokenizerMetadata, _TOKENIZER_KEY)
     tokenizer = build_tokenizer(metadata.network(NetworkConfig()))

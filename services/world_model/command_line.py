@@ -10,15 +10,7 @@ from dextouch.command_line import ProgressLines, write_result
 from dextouch.serving import load_settings
 from dextouch.worlds import World, serve_worlds
 from services.networks.weight_files import digest_of
-from services.world_model.checkpoints import (
-    is_state_checkpoint,
-    is_tokenizer,
-    list_checkpoints,
-    read_checkpoint,
-    read_metadata,
-    read_state_checkpoint,
-    read_tokenizer,
-)
+from services.world_model import checkpoints
 from services.world_model.network.model import Sampling
 from services.world_model.paper_settings import (
     DistillCommand,
@@ -59,14 +51,14 @@ def run_adapt(arguments: list[str]) -> int:
     settings = load_settings(adapt_settings(arguments), arguments)
     if isinstance(settings, AdaptStateCommand):
         return _train_state(settings)
-    network = read_checkpoint(settings.init).metadata.network
+    network = checkpoints.read_checkpoint(settings.init).metadata.network
     return _train(settings.training(network), settings.json_path)
 
 
 def run_distill(arguments: list[str]) -> int:
     """Train a checkpoint to sample in few steps, as `run_train`."""
     settings = load_settings(DistillCommand, arguments)
-    network = read_checkpoint(settings.init).metadata.network
+    network = checkpoints.read_checkpoint(settings.init).metadata.network
     return _train(settings.training(network), settings.json_path)
 
 
@@ -107,10 +99,7 @@ def _show(report: "TrainingReport | StateReport", counts: str, json_path: Path |
 
 
 def run_serve(arguments: list[str]) -> int:
-    """Serve one checkpoint until SIGINT or SIGTERM.
-
-    Rollouts that began in another checkpoint continue in it while it is in the same folder.
-    """
+    """Serve a checkpoint until SIGINT or SIGTERM; rollouts of others in its folder continue."""
     load = partial(load_settings, WorldModelSettings, arguments)
     settings = load()
     serve_worlds(
@@ -136,11 +125,11 @@ def open_by_digest(settings: WorldModelSettings, _: str, digest: str) -> World[A
 
     Of the options, it gets those that it can take.
     """
-    for path, found in list_checkpoints(settings.checkpoint.parent).items():
-        if found == digest and is_state_checkpoint(path):
+    for path, found in checkpoints.list_checkpoints(settings.checkpoint.parent).items():
+        if found == digest and checkpoints.is_state_checkpoint(path):
             return open_world(path)
         if found == digest:
-            metadata, placement = read_metadata(path), settings.placement
+            metadata, placement = checkpoints.read_metadata(path), settings.placement
             if metadata.network.wan is None:
                 whole = {"decode_window": None, "decode_tile_px": None}
                 placement = placement.model_copy(update=whole)
@@ -165,26 +154,28 @@ def run_show(arguments: list[str]) -> int:
     settings = load_settings(ShowCommand, arguments)
     path = settings.checkpoint
     if settings.plan:
-        print(plan_table(read_metadata(path).network))
+        print(plan_table(checkpoints.read_metadata(path).network))
         return 0
-    found = [_history(file) for file in (list_checkpoints(path) if path.is_dir() else [path])]
+    found = [
+        _history(file) for file in (checkpoints.list_checkpoints(path) if path.is_dir() else [path])
+    ]
     print(json.dumps(found, indent=2))
     write_result(settings.json_path, found)
     return 0
 
 
 def _history(file: Path) -> dict[str, Any]:
-    if is_tokenizer(file):
-        stored = read_tokenizer(file)
+    if checkpoints.is_tokenizer(file):
+        stored = checkpoints.read_tokenizer(file)
         about = stored.metadata.model_dump(mode="json", exclude={"train_scenes"})
         return {"file": file.name, "digest": stored.digest, "form": "tactile tokenizer", **about}
-    if is_state_checkpoint(file):
-        state = read_state_checkpoint(file)
+    if checkpoints.is_state_checkpoint(file):
+        state = checkpoints.read_state_checkpoint(file)
         history = {"form": "state model", **state.metadata.model_dump(mode="json")}
         return {"file": file.name, "digest": state.digest, **history}
-    metadata = read_metadata(file)
+    metadata = checkpoints.read_metadata(file)
     # The full size may not fit into memory; the others are read to check their weights, too.
     small = metadata.network.wan is None
-    digest = read_checkpoint(file).digest if small else digest_of(file)
+    digest = checkpoints.read_checkpoint(file).digest if small else digest_of(file)
     history = metadata.model_dump(mode="json", exclude={"train_fingerprints"})
     return {"file": file.name, "digest": digest, "form": "paper's form", **history}

@@ -14,9 +14,8 @@ from dextouch.errors import UnavailableError
 def claimed_device(names: str, folder: Path | None = None) -> str:
     """One of the devices that are named with commas between; it is held until the process ends.
 
-    That with the fewest processes; of several, that of the oldest ones, since they end first when
-    workers are replaced one after another. A process claims once, and then keeps its device. Each
-    holds a lock of a file in `folder`, by default one for all processes of the user.
+    That with the fewest processes, or with the oldest ones, since they end first when workers are
+    replaced one after another. Each holds a lock of a file in `folder`, by default one of the user.
 
     Raises:
         UnavailableError: the folder belongs to another user, or is a link or no folder.

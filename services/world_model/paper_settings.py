@@ -42,6 +42,7 @@ from services.world_model.settings import (
     AdaptationSettings,
     AdaptStateCommand,
     DataSettings,
+    Output,
     TrainStateCommand,
     recorded_command,
 )
@@ -108,9 +109,7 @@ class RunSettings(DataSettings):
     USUAL_STEPS: ClassVar[int] = 10_000
 
     episodes: str = Field(description="URL or folder of the episode store to train on")
-    output: Path = Field(
-        default=Path("runs/world_model/tiny.safetensors"), description="checkpoint to write"
-    )
+    output: Output = Path("runs/world_model/tiny.safetensors")
     name: str = Field(default="tiny", description="model name in the checkpoint")
     preset: str = Field(
         default="tiny", description=f"named settings, flags override: {', '.join(PRESETS)}"
@@ -186,7 +185,7 @@ class TrainSettings(RunSettings):
     network: NetworkConfig = Field(default=NetworkConfig(), description="shape of the network")
 
     def with_adapters(self) -> "TrainSettings":
-        """The settings with a network that has the adapters of `lora`.
+        """The settings with the adapters of `lora`.
 
         Raises:
             InvalidInputError: a network without a pretrained video expert to adapt or to freeze.
@@ -353,9 +352,7 @@ class DistillCommand(CommandSettings, FromCheckpointSettings):
     model_config = service_config("world_model_distill", "dextouch train distill")
 
     steps: int = Field(default=1, ge=1, le=64, description="network calls per chunk")
-    output: Path = Field(
-        default=Path("runs/world_model/distilled.safetensors"), description="checkpoint to write"
-    )
+    output: Output = Path("runs/world_model/distilled.safetensors")
     name: str = Field(default="distilled", description="model name in the checkpoint")
     json_path: Path | None = Field(default=None, alias="json", description=JSON_HELP)
 

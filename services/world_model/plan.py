@@ -1,12 +1,9 @@
 """Memory and FLOPs of a joint model, computed from its configuration without any weights.
 
-The network runs on torch's meta device, which has shapes but no numbers, so that the full size can
-be planned on a laptop. FLOPs are those of matrix products, convolutions and attention (two per
-multiplication and addition); memory is the largest sum of tensors that are alive at one time.
-Attention counts its whole matrix, which fused kernels do not store; working memory of convolutions,
-which depends on the library, is not counted. Both are planned from a few layers, since they grow
-with their number linearly. In training activations count in float32, also where products are
-bfloat16.
+The network runs on torch's meta device. FLOPs are two per multiplication and addition of matrix
+products, convolutions and attention; memory is the largest sum of tensors alive at one time, with
+the whole matrix of attention and without working memory of libraries. Deep models are planned from
+a few layers. In training activations count in float32.
 """
 
 import weakref
@@ -25,10 +22,9 @@ from services.networks.optimizer import learned_weights
 from services.networks.weight_files import memory_of
 from services.world_model.network.attention import CAMERA_DIM, HAND_DIM
 from services.world_model.network.configuration import NetworkConfig, Precision, num_latents
-from services.world_model.network.inputs import GEOMETRY_SIZE, ModelInputs
+from services.world_model.network.inputs import GEOMETRY_SIZE, ModelInputs, kept_bytes
 from services.world_model.network.instruction import MAX_WORDS, key_of
 from services.world_model.network.model import Context, FirstLatents, JointLatents, JointWorldModel
-from services.world_model.network.past import kept_bytes
 from services.world_model.paper_settings import LoraSettings, TrainSettings
 from services.world_model.pretrained_video import freeze_pretrained
 
@@ -67,10 +63,7 @@ class Work:
 
 @dataclass(frozen=True)
 class Plan:
-    """What one action chunk of one rollout needs.
-
-    `kept_bytes` is what the sampler's steps share: keys and values of clean tokens, and conditions.
-    """
+    """What a chunk of one rollout needs; `kept_bytes` is what the sampler's steps share."""
 
     num_steps: int
     num_video_tokens: int
@@ -90,14 +83,11 @@ class Plan:
 class TrainingPlan:
     """Memory of a training's process while it takes a step, in bytes.
 
-    Attributes:
-        weights: all weights, of which codec and tokenizer are `whole` in every process.
-        learned: those with gradients; each has a gradient, two moments of AdamW (`copies` without
-            the gradient), and an average where one is kept.
-        layer: weights of a layer; `outer` those of neither layers nor codec and tokenizer.
-        step: most that forward and backward take beside the weights; of a training of one process
-            with gradients as they come, which at the end of a step are all there.
-        encoding: what the codec takes for the latents of a step's images, with gradients there.
+    Of all `weights`, codec and tokenizer are `whole` in every process; the `learned` have
+    gradients, two moments and maybe an average (`copies` without gradients). `layer` are weights of
+    a layer, `outer` those beside layers and whole parts. `step` is the most that forward and
+    backward take, with all gradients if there is one process, and `encoding` what the codec takes
+    for the latents.
     """
 
     weights: int
@@ -114,8 +104,7 @@ class TrainingPlan:
     def peak_bytes(self) -> int:
         """The most memory, beside the library's own.
 
-        Sharded (FSDP2), a process has its share of weights, gradients and copies. Gathered are the
-        outer weights, and two layers with the gradient of one.
+        Sharded (FSDP2), outer weights and two layers with one gradient are gathered.
         """
         copies = self.copies * self.learned
         if self.shards == 1:
@@ -294,11 +283,7 @@ def _choices(settings: TrainSettings) -> dict[str, TrainSettings]:
 
 
 def training_plan(settings: TrainSettings, num_processes: int = 1) -> TrainingPlan:
-    """Plan of a training step with windows of the greatest length, in one process of several.
-
-    Raises:
-        InvalidInputError: as `TrainSettings.with_adapters`.
-    """
+    """Plan of a step with the longest windows, in one process of several; as `with_adapters`."""
     settings = settings.with_adapters()
     return _of_depth(settings.network.num_layers, partial(_training_plan, settings, num_processes))
 

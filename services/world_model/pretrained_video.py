@@ -1,8 +1,4 @@
-"""Weights of the full-size model's pretrained parts, loaded strictly from a local folder.
-
-Files are safetensors in diffusers' layout, whole or sharded. Names, shapes and the memory needed
-are checked from the files' headers before any weight is read. Nothing is ever downloaded.
-"""
+"""Weights of the full-size model's pretrained parts, loaded strictly from a local folder."""
 
 import json
 import os
@@ -26,12 +22,12 @@ from services.networks.weight_files import (
 )
 from services.world_model.network.codecs import WanVideoCodec
 from services.world_model.network.configuration import NetworkConfig, WanFiles
-from services.world_model.network.low_rank import is_adapter
 from services.world_model.network.model import JointWorldModel
 from services.world_model.network.video import (
     WanBlock,
     WanVideoCondition,
     WanVideoExpert,
+    is_adapter,
 )
 
 # As diffusers names the weight files of a network.
@@ -48,8 +44,7 @@ def initial_model(
 ) -> JointWorldModel:
     """A new model; that of the full size begins with the pretrained weights of its files.
 
-    With `filled_later`, a checkpoint replaces all weights, so that files are not needed. `prepare`
-    is called before the pretrained weights have memory, such as to shard them.
+    With `filled_later`, a checkpoint replaces them. `prepare` is called before weights have memory.
 
     Raises:
         InvalidInputError: the full size without a folder.
@@ -92,13 +87,9 @@ def share_texts(source: JointWorldModel, target: JointWorldModel) -> None:
 
 
 def load_pretrained(model: JointWorldModel, folder: Path, *, max_bytes: int | None = None) -> None:
-    """Load transformer and autoencoder, and use the folder's text encoder when it is needed.
+    """Load transformer and autoencoder of a model of the full size, and use the text encoder.
 
-    Args:
-        model: of the full size; its other parts keep their initial weights.
-        folder: Wan2.2-TI2V-5B in diffusers' layout (`transformer`, `vae`, `text_encoder`,
-            `tokenizer`).
-        max_bytes: limit of memory for each network; None for the memory that is available.
+    `folder` is Wan2.2-TI2V-5B in diffusers' layout; `max_bytes` limits each network's memory.
 
     Raises:
         InvalidInputError: a model of the small size, or weights that do not fit its sizes.
@@ -141,16 +132,10 @@ class _Transformer(nn.Module):
 def load_weights(
     network: nn.Module, folder: Path, *, where: str, max_bytes: int | None = None
 ) -> None:
-    """Load a network in place, in the precision of its parameters.
+    """Load a network, which may be on the meta device or sharded, in place, in its precision.
 
-    It may be on the meta device, or sharded over processes, of which each reads all and keeps its
-    shares. Adapters and non-persistent buffers stay as they are.
-
-    Args:
-        network: network to load.
-        folder: folder of its safetensors files, as diffusers writes them.
-        where: context for error messages.
-        max_bytes: limit of memory for the weights; None for what is available.
+    Names, shapes and memory (`max_bytes`; None: what is available) are checked from headers first.
+    Adapters and non-persistent buffers stay as they are.
 
     Raises:
         NotFoundError: no such folder or file, or a shard is missing.

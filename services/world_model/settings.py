@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import Field
 from pydantic_settings import CliImplicitFlag
@@ -13,8 +13,11 @@ from dextouch.serving import CommandSettings, service_config
 from dextouch.worlds import WorldServiceSettings
 from services.networks.training_settings import (
     USUAL_IMAGE_PX,
+    AdamWSettings,
     AverageDecay,
     Batch,
+    BudgetSettings,
+    CpuBudget,
     ImagePx,
     LearningRate,
     NonNegative,
@@ -23,23 +26,48 @@ from services.networks.training_settings import (
     Splits,
     Stores,
     Tasks,
+    WarmupSteps,
     WeightDecay,
 )
 from services.world_model.network.configuration import (
     SPATIAL_FACTOR,
     Precision,
+    RendererConfig,
     Sampler,
     WanFiles,
 )
 from services.world_model.presets import PRESETS
-from services.world_model.rendering.configuration import RendererConfig, RendererTraining
-from services.world_model.shipped_checkpoints import PRETRAINED, default_checkpoint
+
+# Checkpoints that ship with the package.
+PRETRAINED = Path(__file__).parent / "pretrained"
+STATE_MODEL, PAPER_FORM = "state.safetensors", "tiny.safetensors"
+
+
+def default_checkpoint() -> Path:
+    """Default checkpoint of the package: the state model if it is installed."""
+    state = PRETRAINED / STATE_MODEL
+    return state if state.is_file() else paper_form_checkpoint()
+
+
+def paper_form_checkpoint() -> Path:
+    """Checkpoint of the joint flow-matching model that ships with the package."""
+    return PRETRAINED / PAPER_FORM
+
+
+Output = Annotated[Path, Field(description="checkpoint to write")]
+DisjointTasks = Annotated[
+    CliImplicitFlag[bool], Field(description="refuse human episodes of tasks that robots have, too")
+]
+NewTasks = Annotated[
+    CliImplicitFlag[bool],
+    Field(description="refuse tasks that the initial checkpoint was trained on"),
+]
 
 
 class DataSettings(FrozenModel):
     """Episodes of people and robots that a world model of either form is trained on.
 
-    With `human` stores, `episodes` and `heldout` give robot episodes alone, and `human` human ones.
+    With `human` stores, `episodes` and `heldout` give robot episodes alone.
     """
 
     human: tuple[str, ...] = Field(
@@ -52,12 +80,8 @@ class DataSettings(FrozenModel):
     human_episodes: int | None = Field(
         default=None, ge=0, description="number of human episodes, in the same way"
     )
-    disjoint_tasks: CliImplicitFlag[bool] = Field(
-        default=True, description="refuse human episodes of tasks that robots have, too"
-    )
-    new_tasks: CliImplicitFlag[bool] = Field(
-        default=False, description="refuse tasks that the initial checkpoint was trained on"
-    )
+    disjoint_tasks: DisjointTasks = True
+    new_tasks: NewTasks = False
     splits: Splits = ()
     heldout: str | None = Field(
         default=None, description="store to evaluate on; default: a share of `episodes`, by hash"
@@ -72,16 +96,10 @@ class DataSettings(FrozenModel):
 class AdaptationSettings(FrozenModel):
     """What adaptations of either form to new tasks have in common."""
 
-    output: Path = Field(
-        default=Path("runs/world_model/adapted.safetensors"), description="checkpoint to write"
-    )
+    output: Output = Path("runs/world_model/adapted.safetensors")
     name: str = Field(default="adapted", description="model name in the checkpoint")
-    disjoint_tasks: CliImplicitFlag[bool] = Field(
-        default=False, description="refuse human episodes of tasks that robots have, too"
-    )
-    new_tasks: CliImplicitFlag[bool] = Field(
-        default=True, description="refuse tasks that the initial checkpoint was trained on"
-    )
+    disjoint_tasks: DisjointTasks = False
+    new_tasks: NewTasks = True
 
 
 class ReaderSettings(FrozenModel):
@@ -125,6 +143,22 @@ class CoreSettings(FrozenModel):
     weights: CoreLossWeights = Field(default=CoreLossWeights(), description="weights of targets")
 
 
+class RendererTraining(AdamWSettings, BudgetSettings):
+    """One training run of the renderer."""
+
+    cpu_budget_s: CpuBudget = 400.0
+    batch: Batch = 24
+    warmup_steps: WarmupSteps = 50
+    weight_decay: WeightDecay = 0.01
+    gradient_weight: NonNegative = Field(default=0.5, description="image gradient loss")
+    sharpness_weight: NonNegative = Field(
+        default=0.3, description="edge strength loss (7 px windows)"
+    )
+    shaken_fraction: Share = Field(default=0.5, description="share of pairs with pose noise")
+    shake_m: NonNegative = Field(default=0.003, description="position noise per axis")
+    uses_bfloat16: bool = Field(default=True, description="convolve in bfloat16 if that is faster")
+
+
 # What is trained of an initial state model: all but its codec; readers and the estimate of success;
 # or that estimate alone.
 Learned = Literal["all", "readers", "success"]
@@ -139,9 +173,7 @@ class StateTrainSettings(DataSettings):
         default=None,
         description="JSON file of objects: how hands touch them, and clicks (docs/objects.md)",
     )
-    output: Path = Field(
-        default=Path("runs/world_model/state.safetensors"), description="checkpoint to write"
-    )
+    output: Output = Path("runs/world_model/state.safetensors")
     name: str = Field(default="state", description="model name in the checkpoint")
     init: Path | None = Field(
         default=None, description="state model to start from; --learn says what is trained of it"
@@ -331,10 +363,7 @@ class WorldModelSettings(WorldServiceSettings):
 def recorded_command(
     settings: FrozenModel, command: str, places: Sequence[str], left_out: set[str]
 ) -> str:
-    """Command that repeats a run: every setting that differs from its default, but for `left_out`.
-
-    Of `places`, stores and files, the last path component is given: folders differ by machine.
-    """
+    """Command that repeats a run, with `places` by their last path components alone."""
 
     def last_name(url: str) -> str:
         return url.rstrip("/").rsplit("/", 1)[-1]

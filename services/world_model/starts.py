@@ -1,8 +1,9 @@
 """Validated rollout starts, action chunks and snapshots, for both kinds of world model."""
 
+from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 import torch
@@ -22,6 +23,7 @@ from dextouch.images import scaled_square
 from dextouch.schemas import EVERYTHING, Observation, ReturnSelector, RolloutStart, WorldDescription
 from dextouch.streams import HEAD_CAMERA, unpack
 from dextouch.tactile.layout import DEXTOUCH_V1, TactileLayout
+from dextouch.worlds import BatchWorld, SteppedRollout
 from services.world_model.checkpoints import StateCheckpoint
 from services.world_model.dynamics.features import (
     BOX_AXES,
@@ -42,11 +44,7 @@ LAST_HORIZONS = 4
 
 @dataclass(frozen=True)
 class ObservedStart:
-    """The step that a rollout begins with; its arrays are copies.
-
-    Touch is clipped at zero; `reached` is relative to the poses of step 0, so its poses are the
-    identity.
-    """
+    """The step that a rollout begins with, in copies; `reached` poses are the identity."""
 
     image: UInt8[np.ndarray, "h w 3"]
     tactile_kpa: Float32[np.ndarray, "2 taxels"]
@@ -119,11 +117,10 @@ def observed_start(
 
 
 def check_geometry(anchor: AnchorPoses, K_head: Float64[np.ndarray, "3 3"]) -> None:
-    """Reject poses far from the world's origin and implausible intrinsics.
+    """Reject anchors farther than 5 m and implausible focal lengths or principal points.
 
     Raises:
-        InvalidInputError: an anchor farther than 5 m, or an implausible focal length or principal
-            point.
+        InvalidInputError: these.
         NonFiniteError: NaN or infinity.
     """
     Ts = np.stack([np.asarray(T, dtype=np.float64) for T in anchor.as_tuple()])
@@ -143,70 +140,84 @@ def check_geometry(anchor: AnchorPoses, K_head: Float64[np.ndarray, "3 3"]) -> N
         )
 
 
-def refuse_ended(num_moving: int, horizon_latents: int, world: WorldDescription) -> None:
-    """Refuse chunks after `num_moving` latent steps with motion; episodes have `horizon_latents`.
+@runtime_checkable
+class Moving(Protocol):
+    """State of a rollout that counts the latent steps in which its hands moved."""
 
-    Raises:
-        EndedError: the hands have moved four times as long as any episode of training.
-    """
-    limit = LAST_HORIZONS * horizon_latents
-    if num_moving >= limit:
-        seconds = limit * STEPS_PER_LATENT / world.model_rate_hz
-        reason = (
-            f"hands moved for {seconds:.0f} s, four times as long as any episode this model "
-            "was trained on"
-        )
-        raise EndedError(f"world {world.name}: {reason}", reason=reason)
+    @property
+    def num_moving(self) -> int:
+        """The count."""
 
 
-def checked_selectors(
-    states: Sequence[object],
-    actions: np.ndarray,
-    seeds: Sequence[int],
-    selectors: Sequence[ReturnSelector] | None,
-) -> list[ReturnSelector]:
-    """The selector of every rollout of a batch; by default everything is returned.
-
-    Raises:
-        ShapeError: no rollout, or not one action chunk, seed and selector for each.
-    """
-    requested = [EVERYTHING] * len(states) if selectors is None else list(selectors)
-    counts = (len(states), len(actions), len(seeds), len(requested))
-    if len(set(counts)) != 1 or len(states) == 0:
-        raise ShapeError(
-            f"chunks: got {counts[0]} states, {counts[1]} action chunks, {counts[2]} seeds and "
-            f"{counts[3]} selectors, expected one of each for every rollout"
-        )
-    return requested
+State = TypeVar("State", bound=Moving)
 
 
-def checked_chunk(
-    actions: np.ndarray, description: WorldDescription
-) -> Float64[np.ndarray, "steps 67"]:
-    """Actions that a world accepts as one chunk.
+class PredictedWorld(BatchWorld[State]):
+    """World of a checkpoint of either kind, with training episodes of `_horizon_latents`."""
 
-    Raises:
-        ShapeError: a chunk of another length.
-        InvalidInputError: physically impossible actions.
-    """
-    chunk = check_actions(actions, where="action chunk")
-    multiple, longest = description.chunk_multiple, description.max_chunk_steps
-    if len(chunk) % multiple or len(chunk) > longest:
-        raise ShapeError(
-            f"action chunk: got {len(chunk)} rows, expected a multiple of {multiple} up to "
-            f"{longest}"
-        )
-    return chunk
+    _description: WorldDescription
+    _horizon_latents: int
+
+    @property
+    def description(self) -> WorldDescription:
+        """Capabilities and limits of this world."""
+        return self._description
+
+    @abstractmethod
+    def _stepped(
+        self,
+        states: Sequence[State],
+        chunks: list[np.ndarray],
+        seeds: Sequence[int],
+        requested: list[ReturnSelector],
+    ) -> list[SteppedRollout[State]]:
+        """`step_batch` of checked arguments."""
+
+    def step_batch(
+        self,
+        states: Sequence[State],
+        actions: Float64[np.ndarray, "batch steps 67"],
+        *,
+        seeds: Sequence[int],
+        selectors: Sequence[ReturnSelector] | None = None,
+    ) -> list[SteppedRollout[State]]:
+        """Predict action chunks of 4k steps; others of the batch change results by rounding.
+
+        Raises:
+            ShapeError: a chunk of another length, or not one and a seed for each rollout.
+            InvalidInputError: physically impossible actions, or views without a start.
+            EndedError: hands have moved four times as long as any episode of training.
+            UnavailableError: the model predicts NaN or infinity.
+        """
+        requested = [EVERYTHING] * len(states) if selectors is None else list(selectors)
+        counts = (len(states), len(actions), len(seeds), len(requested))
+        if len(set(counts)) != 1 or len(states) == 0:
+            raise ShapeError(
+                f"chunks: got {counts[0]} states, {counts[1]} action chunks, {counts[2]} seeds and "
+                f"{counts[3]} selectors, expected one of each for every rollout"
+            )
+        world, limit = self._description, LAST_HORIZONS * self._horizon_latents
+        if any(state.num_moving >= limit for state in states):
+            seconds = limit * STEPS_PER_LATENT / world.model_rate_hz
+            reason = (
+                f"hands moved for {seconds:.0f} s, four times as long as any episode this model "
+                "was trained on"
+            )
+            raise EndedError(f"world {world.name}: {reason}", reason=reason)
+        chunks = [check_actions(chunk, where="action chunk") for chunk in actions]
+        multiple, longest, length = world.chunk_multiple, world.max_chunk_steps, len(chunks[0])
+        if length % multiple or length > longest:
+            raise ShapeError(
+                f"action chunk: got {length} rows, expected a multiple of {multiple} up to "
+                f"{longest}"
+            )
+        return self._stepped(states, chunks, seeds, requested)
 
 
 def opened_snapshot(
     data: bytes, digest: str, *, max_bytes: int
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Fields and arrays of a snapshot of the world with this digest.
-
-    Raises:
-        InvalidInputError: not a snapshot of this world.
-    """
+    """Fields and arrays of a snapshot; raises InvalidInputError for one of another digest."""
     fields, arrays = unpack(data, max_bytes=max_bytes)
     if fields.get("digest") != digest:
         raise InvalidInputError(
@@ -248,11 +259,7 @@ class SceneReader:
     def objects(
         self, requests: Sequence[PredictionRequest], tasks: Sequence[str]
     ) -> list[ObjectsAtStart]:
-        """Objects at the first step of every request.
-
-        Raises:
-            UnknownNameError: a task that the state model was not trained on.
-        """
+        """Objects at first steps; raises UnknownNameError for a task that is not known."""
         unknown = sorted(set(tasks) - set(self.tasks))
         if unknown:
             raise UnknownNameError("task of the start readers", unknown[0], list(self.tasks))

@@ -20,29 +20,10 @@ from dextouch.schemas import (
     WorldDescription,
 )
 from dextouch.streams import HEAD_CAMERA, pack
-from dextouch.worlds import BatchWorld, StartedRollout, SteppedRollout
+from dextouch.worlds import StartedRollout, SteppedRollout
 from services.world_model import starts
 from services.world_model.checkpoints import StateCheckpoint
-from services.world_model.dynamics.features import (
-    BOX_AXES,
-    STEPS_PER_LATENT,
-    Commands,
-    ObjectPoses,
-    hand_motion,
-    instruction_features,
-    poses_from_objects,
-)
-from services.world_model.dynamics.model import (
-    PRESENCE_THRESHOLD,
-    ImaginedSteps,
-    SceneMemory,
-    batched,
-    first_steps,
-    mean_poses,
-    memory_arrays,
-    memory_from_arrays,
-    memory_of,
-)
+from services.world_model.dynamics import features, model
 from services.world_model.network.configuration import NetworkConfig
 from services.world_model.network.inputs import (
     ACTION_KINDS,
@@ -67,8 +48,7 @@ _SAME_INSTRUCTION = 0.999
 class StateRollout:
     """State of a rollout: its start and the memory of its scene.
 
-    `first_reached` and `reached` are relative to `anchor`, the poses of step 0; `num_moving` counts
-    the latent steps in which hands moved.
+    `first_reached` is relative to `anchor`; `num_moving` counts latent steps in which hands moved.
     """
 
     task: str
@@ -77,19 +57,13 @@ class StateRollout:
     anchor: AnchorPoses
     K_head: Float64[np.ndarray, "3 3"]
     first_reached: Float64[np.ndarray, "67"]
-    memory: SceneMemory
+    memory: model.SceneMemory
     step: int = 0
     num_moving: int = 0
 
 
-class StateWorld(BatchWorld[StateRollout]):
-    """A state model as a world.
-
-    Deterministic: the seeds of chunks have no effect.
-
-    Raises:
-        InvalidInputError: weights that are not float32.
-    """
+class StateWorld(starts.PredictedWorld[StateRollout]):
+    """A deterministic world of a state model; raises InvalidInputError unless it is in float32."""
 
     def __init__(self, checkpoint: StateCheckpoint) -> None:
         others = {weight.dtype for weight in checkpoint.dynamics.parameters()} - {torch.float32}
@@ -102,8 +76,9 @@ class StateWorld(BatchWorld[StateRollout]):
         self._dynamics.trace()
         self._renderer = Renderer(checkpoint.renderer)
         self._metadata, self._digest = checkpoint.metadata, checkpoint.digest
+        self._horizon_latents = self._metadata.bounds.horizon_latents
         config = self._metadata.dynamics
-        self._instructions = instruction_features(config.instructions, config)
+        self._instructions = features.instruction_features(config.instructions, config)
         self._description = WorldDescription(
             name=self._metadata.name,
             kind="model",
@@ -115,26 +90,16 @@ class StateWorld(BatchWorld[StateRollout]):
             model_rate_hz=self._metadata.model_rate_hz,
             action_kinds=ACTION_KINDS,
             starts_from=("observation",),
-            chunk_multiple=STEPS_PER_LATENT,
+            chunk_multiple=features.STEPS_PER_LATENT,
             max_chunk_steps=MAX_CHUNK_STEPS,
             object_names=self._metadata.object_names,
             scales_images=True,
             tactile_layout=config.layout,
         )
 
-    @property
-    def description(self) -> WorldDescription:
-        """Capabilities and limits of this world."""
-        return self._description
-
     @torch.inference_mode()
     def reset(self, start: RolloutStart) -> StartedRollout[StateRollout]:
-        """Find the objects of one observed step and start a rollout.
-
-        Raises:
-            UnknownNameError: a task or action kind that the model was not trained on.
-            InvalidInputError: missing or invalid observation, anchor or K_head.
-        """
+        """Find the objects of an observed step; raises as `observed_start`, `build_inputs`."""
         first = starts.observed_start(
             start,
             tasks=self._description.tasks,
@@ -142,10 +107,10 @@ class StateWorld(BatchWorld[StateRollout]):
             image_px=self._metadata.dynamics.image_px,
         )
         self._check_start(start, first)
-        motion = hand_motion(first.reached[None], first.anchor)
+        motion = features.hand_motion(first.reached[None], first.anchor)
         task = self._description.tasks.index(start.task)
         memory = self._dynamics.begin(
-            first_steps(
+            model.first_steps(
                 [first.image],
                 [first.K_head],
                 [first.tactile_kpa],
@@ -154,9 +119,9 @@ class StateWorld(BatchWorld[StateRollout]):
                 self._metadata.dynamics.tactile_layout,
             ),
             torch.from_numpy(first.tactile_kpa)[None],
-            Commands.holding([motion]),
+            features.Commands.holding([motion]),
             torch.tensor([float(start.action_kind == "commanded")]),
-            instruction_features([start.instruction], self._metadata.dynamics),
+            features.instruction_features([start.instruction], self._metadata.dynamics),
         )
         rollout = StateRollout(
             task=start.task,
@@ -176,7 +141,7 @@ class StateWorld(BatchWorld[StateRollout]):
         request = PredictionRequest(
             first_image=first.image,
             first_tactile_kpa=first.tactile_kpa,
-            actions=np.repeat(first.reached[None], 1 + STEPS_PER_LATENT, axis=0),
+            actions=np.repeat(first.reached[None], 1 + features.STEPS_PER_LATENT, axis=0),
             action_kind=start.action_kind,
             instruction=start.instruction,
             anchor=first.anchor,
@@ -187,35 +152,21 @@ class StateWorld(BatchWorld[StateRollout]):
         build_inputs([request], limits)
 
     @torch.inference_mode()
-    def step_batch(
+    def _stepped(
         self,
         states: Sequence[StateRollout],
-        actions: Float64[np.ndarray, "batch steps 67"],
-        *,
-        seeds: Sequence[int],
-        selectors: Sequence[ReturnSelector] | None = None,
+        chunks: list[np.ndarray],
+        _: Sequence[int],
+        requested: list[ReturnSelector],
     ) -> list[SteppedRollout[StateRollout]]:
-        """Predict action chunks of 4k ≤ 64 steps; others of the batch change results by rounding.
-
-        Raises:
-            ShapeError: a chunk of another length.
-            InvalidInputError: physically impossible actions.
-            EndedError: the hands have moved four times as long as any episode of training.
-            UnavailableError: the model predicts NaN or infinity.
-        """
-        requested = starts.checked_selectors(states, actions, seeds, selectors)
-        for state in states:
-            horizon = self._metadata.bounds.horizon_latents
-            starts.refuse_ended(state.num_moving, horizon, self._description)
-        chunks = [starts.checked_chunk(chunk, self._description) for chunk in actions]
         for chunk in chunks:
             check_reach(chunk)
         motions = [
-            hand_motion(chunk, state.anchor, validated=True)
+            features.hand_motion(chunk, state.anchor, validated=True)
             for chunk, state in zip(chunks, states, strict=True)
         ]
-        memory = batched([state.memory for state in states])
-        following, imagined = self._dynamics.advance(memory, Commands.of(motions))
+        memory = model.batched([state.memory for state in states])
+        following, imagined = self._dynamics.advance(memory, features.Commands.of(motions))
         checked = {
             "touch": imagined.tactile_kpa,
             "objects' place": imagined.poses.position_m,
@@ -226,7 +177,7 @@ class StateWorld(BatchWorld[StateRollout]):
             self._answer(
                 replace(
                     state,
-                    memory=memory_of(following, index),
+                    memory=model.memory_of(following, index),
                     step=state.step + len(chunks[index]),
                     num_moving=state.num_moving + int(imagined.moves[index].sum()),
                 ),
@@ -251,12 +202,19 @@ class StateWorld(BatchWorld[StateRollout]):
         self,
         state: StateRollout,
         chunk: np.ndarray,
-        imagined: tuple[ImaginedSteps, int],
+        imagined: tuple[model.ImaginedSteps, int],
         selector: ReturnSelector,
     ) -> tuple[SteppedRollout[StateRollout], Drawing | None]:
         """The chunk's observation without images, and what to draw if images are requested."""
         steps, index = imagined
-        poses = self._poses(steps.poses[index], state.task)
+        poses, bounds = self._poses(steps.poses[index], state.task), self._metadata.bounds
+        uncertainty = self._uncertainty(state, steps, index)
+        # The largest figure as a share of its bound; above 1 it is outside.
+        bound_share = max(
+            state.num_moving / (UNRELIABLE_HORIZONS * bounds.horizon_latents),
+            uncertainty.disagreement / max(bounds.disagreement_m, 1e-9),
+            uncertainty.distance / bounds.latent_distance,
+        )
         observation = Observation(
             first_step=state.step - len(chunk) + 1,
             images={},
@@ -264,40 +222,30 @@ class StateWorld(BatchWorld[StateRollout]):
             action_reached=chunk,
             reached_is_measured=False,
             object_poses=poses,
-            uncertainty=self._uncertainty(state, steps, index),
+            uncertainty=uncertainty,
         ).selected(selector)
         drawing = None
         if selector.wants(HEAD_CAMERA):
             shown = slice(len(chunk) - len(observation), None)
             drawing = self._drawing(state, chunk[shown], poses[shown])
-        info = {BOUND_SHARE: self._bound_share(state, steps, index)}
-        return SteppedRollout(state, observation, info), drawing
-
-    def _bound_share(self, state: StateRollout, steps: ImaginedSteps, index: int) -> float:
-        """The largest figure of `_uncertainty` as a share of its bound; above 1 it is outside."""
-        bounds = self._metadata.bounds
-        disagreement_m = float(steps.disagreement_m[index].max())
-        shares = (
-            state.num_moving / (UNRELIABLE_HORIZONS * bounds.horizon_latents),
-            disagreement_m / max(bounds.disagreement_m, 1e-9),
-            float(steps.distance[index].max()) / bounds.latent_distance,
-        )
-        return max(shares)
+        return SteppedRollout(state, observation, {BOUND_SHARE: bound_share}), drawing
 
     def _drawing(
         self, state: StateRollout, actions: np.ndarray, poses: Float32[np.ndarray, "n objects 7"]
     ) -> Drawing:
         actions = np.concatenate([state.first_reached[None], actions])
-        first = self._poses(mean_poses(state.memory.start.objects), state.task)
+        first = self._poses(model.mean_poses(state.memory.start.objects), state.task)
         poses = np.concatenate([first, poses])
         present = poses[..., 2] > ABSENT_POSE[2]
         states = SceneStates.of_actions(actions, state.anchor, poses, present, validated=True)
         boxes_m = np.array(self._metadata.object_boxes_m[state.task])
         size = state.memory.start.size.mean(0)[0, : len(boxes_m)].double().numpy()
-        boxes_m = boxes_m * size[:, BOX_AXES]
+        boxes_m = boxes_m * size[:, features.BOX_AXES]
         return Drawing(state.image, state.K_head, states, boxes_m)
 
-    def _uncertainty(self, state: StateRollout, steps: ImaginedSteps, index: int) -> Uncertainty:
+    def _uncertainty(
+        self, state: StateRollout, steps: model.ImaginedSteps, index: int
+    ) -> Uncertainty:
         """`distance` is of the hands' motion alone, and no part uses the readers' own `sd_m`."""
         bounds = self._metadata.bounds
         # Of the worst latent step, independent of the chunk length.
@@ -305,7 +253,7 @@ class StateWorld(BatchWorld[StateRollout]):
         distance = float(steps.distance[index].max())
         count = len(self._metadata.object_names[state.task])
         seen = state.memory.start.objects.present[..., :count]
-        found = bool((seen > PRESENCE_THRESHOLD).all())
+        found = bool((seen > model.PRESENCE_THRESHOLD).all())
         reason = None
         if state.num_moving > UNRELIABLE_HORIZONS * bounds.horizon_latents:
             reason = "hands moved longer than in any episode of training"
@@ -341,11 +289,13 @@ class StateWorld(BatchWorld[StateRollout]):
         )
         return not self._instructions.numel() or float(cosines.max()) > _SAME_INSTRUCTION
 
-    def _poses(self, objects: ObjectPoses, task: str) -> Float32[np.ndarray, "n objects 7"]:
+    def _poses(
+        self, objects: features.ObjectPoses, task: str
+    ) -> Float32[np.ndarray, "n objects 7"]:
         """Poses of the task's objects; absent ones lie below the table."""
         used = objects.slots(len(self._metadata.object_names[task]))
-        poses = poses_from_objects(used).astype(np.float32)
-        there = used.present.numpy() > PRESENCE_THRESHOLD
+        poses = features.poses_from_objects(used).astype(np.float32)
+        there = used.present.numpy() > model.PRESENCE_THRESHOLD
         return np.where(there[..., None], poses, ABSENT_POSE)
 
     def snapshot(self, state: StateRollout) -> bytes:
@@ -358,15 +308,10 @@ class StateWorld(BatchWorld[StateRollout]):
             "K_head": state.K_head,
             "first_reached": state.first_reached,
         }
-        return pack(fields, {**arrays, **memory_arrays(state.memory)})
+        return pack(fields, {**arrays, **model.memory_arrays(state.memory)})
 
     def restore(self, data: bytes) -> StateRollout:
-        """Restore the state of a snapshot; validates untrusted bytes.
-
-        Raises:
-            InvalidInputError: not a snapshot of this checkpoint.
-            NonFiniteError: NaN or infinity.
-        """
+        """Restore a snapshot; raises InvalidInputError or NonFiniteError for another's."""
         fields, arrays = starts.opened_snapshot(data, self._digest, max_bytes=MAX_SNAPSHOT_BYTES)
         config, name = self._metadata.dynamics, fields.get("task")
         step, moving = fields.get("step"), fields.get("num_moving")
@@ -382,7 +327,7 @@ class StateWorld(BatchWorld[StateRollout]):
             raise starts.foreign_snapshot(fields, arrays)
         anchor, K_head = AnchorPoses(*np.array(arrays["anchor"])), np.array(arrays["K_head"])
         starts.check_geometry(anchor, K_head)
-        memory = memory_from_arrays(arrays, config, self._metadata.num_members)
+        memory = model.memory_from_arrays(arrays, config, self._metadata.num_members)
         if int(memory.start.task[0, 0]) != config.tasks.index(name):
             raise InvalidInputError(f"snapshot: its memory belongs to another task than {name!r}")
         first_reached = check_actions(arrays["first_reached"][None], where="snapshot")

@@ -21,25 +21,29 @@ from dextouch.schemas import (
 )
 from dextouch.streams import HEAD_CAMERA, pack
 from dextouch.tactile.layout import described
-from dextouch.worlds import BatchWorld, StartedRollout, SteppedRollout, asked_cameras
+from dextouch.worlds import StartedRollout, SteppedRollout, asked_cameras
 from services.networks.weight_files import on_device
 from services.world_model import checkpoints, starts
 from services.world_model.devices import claimed_device
 from services.world_model.dynamics.features import FREE_KPA, NUM_POINTS, hand_motion
-from services.world_model.dynamics.model import REST_LATENTS, Stillness, stillness
+from services.world_model.dynamics.model import REST_LATENTS, stillness
 from services.world_model.network.attention import split_axis
 from services.world_model.network.codecs import WanVideoCodec, to_uint8, to_unit
 from services.world_model.network.configuration import (
     FRAMES_PER_LATENT,
-    GloveNetworkConfig,
     NetworkConfig,
-    Precision,
 )
-from services.world_model.network.inputs import ACTION_KINDS, PredictionRequest, build_inputs
+from services.world_model.network.inputs import (
+    ACTION_KINDS,
+    MAX_KEPT,
+    PastImages,
+    PastRule,
+    PredictionRequest,
+    build_inputs,
+    kept_bytes,
+)
 from services.world_model.network.model import Sampling, stack_noise
-from services.world_model.network.past import MAX_KEPT, PastImages, PastRule, kept_bytes
-from services.world_model.settings import Placement
-from services.world_model.shipped_checkpoints import default_checkpoint
+from services.world_model.settings import Placement, default_checkpoint
 from services.world_model.state_world import StateWorld
 
 MAX_SNAPSHOT_BYTES = 4 * 2**20
@@ -53,10 +57,7 @@ _NUM_WATCHED_POINTS = NUM_POINTS + len(_CAMERA_POINTS_M)
 
 @dataclass(frozen=True)
 class KeptImages:
-    """Images that a rollout remembers, the oldest first: steps, poses then, and latents.
-
-    Latents are half as precise as those of the network, so that a snapshot has all of them.
-    """
+    """Images that a rollout remembers, the oldest first: steps, poses then, and latents."""
 
     steps: tuple[int, ...]
     reached: Float64[np.ndarray, "kept 67"]
@@ -99,9 +100,8 @@ class KeptImages:
 class ModelState(starts.ObservedStart):
     """State of a rollout: its last step; `reached` is relative to `anchor`, the poses of step 0.
 
-    `still_m` are points of hands and camera when they last moved, `num_still` the latent steps
-    since then, and `num_moving` all those with motion. `further` has the last image of each further
-    view that the start had, and `kept` the images that are remembered.
+    `still_m` are points of hands and camera when they last moved, `num_still` latent steps ago;
+    `num_moving` counts those with motion. `further` has the last images of further views.
     """
 
     instruction: str
@@ -115,14 +115,13 @@ class ModelState(starts.ObservedStart):
     further: dict[str, UInt8[np.ndarray, "h w 3"]] = field(default_factory=dict)
 
 
-class ModelWorld(BatchWorld[ModelState]):
+class ModelWorld(starts.PredictedWorld[ModelState]):
     """A flow-matching model as a world.
 
-    Without `sampling`, the checkpoint's is used. `precision` is that of the experts' matrix
-    products; codecs are float32. With contact geometry, `reader` finds objects at a chunk's start.
-
-    A scene is at rest in chunks without motion that follow two seconds without motion, or a start
-    at which the hands touch nothing: it stays as it is, bit for bit, without the network.
+    With contact geometry, `reader` finds
+    objects at a chunk's start. A scene is at rest, bit for bit and without the network, in chunks
+    without motion that follow two seconds without motion, or a start at which the hands touch
+    nothing.
 
     Raises:
         InvalidInputError: a model with contact geometry, and no reader of all its tasks and of the
@@ -134,13 +133,11 @@ class ModelWorld(BatchWorld[ModelState]):
         checkpoint: checkpoints.Checkpoint,
         *,
         sampling: Sampling | None = None,
-        precision: Precision = "float32",
         reader: starts.SceneReader | None = None,
     ) -> None:
         self._model = checkpoint.model
         self._digest = checkpoint.digest
         self._sampling = sampling
-        self._precision: Precision = precision
         config, metadata = checkpoint.metadata.network, checkpoint.metadata
         self._horizon_latents = metadata.horizon_latents
         self._needs_views = not metadata.view_dropout
@@ -161,24 +158,11 @@ class ModelWorld(BatchWorld[ModelState]):
             starts_from=("observation",),
             max_chunk_steps=config.max_steps - 1,
             predicts_touch=config.use_touch,
-            tactile_layout=(
-                config.tactile_layout if isinstance(config, GloveNetworkConfig) else None
-            ),
+            tactile_layout=None if config.layout is None else config.tactile_layout,
         )
 
-    @property
-    def description(self) -> WorldDescription:
-        """Capabilities and limits of this world."""
-        return self._description
-
     def reset(self, start: RolloutStart) -> StartedRollout[ModelState]:
-        """Start a rollout from one observed step.
-
-        Raises:
-            UnknownNameError: a task or action kind that the model was not trained on.
-            InvalidInputError: missing or invalid observation, anchor or K_head; an instruction that
-                the full size neither knows nor can encode.
-        """
+        """Start a rollout; raises as `observed_start`, `build_inputs` and `TextFeatures.of`."""
         first = starts.observed_start(
             start, tasks=self._description.tasks, layout=self._model.config.tactile_layout
         )
@@ -211,35 +195,26 @@ class ModelWorld(BatchWorld[ModelState]):
         observation.images.update({name: image[None] for name, image in further.items()})
         return StartedRollout(state, observation, first.anchor, first.K_head)
 
-    def step_batch(
+    def _stepped(
         self,
         states: Sequence[ModelState],
-        actions: Float64[np.ndarray, "batch steps 67"],
-        *,
+        chunks: list[np.ndarray],
         seeds: Sequence[int],
-        selectors: Sequence[ReturnSelector] | None = None,
+        requested: list[ReturnSelector],
     ) -> list[SteppedRollout[ModelState]]:
-        """Predict action chunks of 4k ≤ 16 steps; others of the batch change results by rounding.
-
-        The last image is always decoded, since the next chunk starts from it; the others only on
-        request, which at full size may change the last one by rounding.
-
-        Raises:
-            ShapeError: a chunk of another length.
-            InvalidInputError: physically impossible actions.
-            EndedError: hands or camera have moved four times as long as any episode of training.
-            UnavailableError: the model returned NaN or infinity.
-        """
-        requested = starts.checked_selectors(states, actions, seeds, selectors)
         for state, selector in zip(states, requested, strict=True):
-            starts.refuse_ended(state.num_moving, self._horizon_latents, self._description)
             if absent := {*(selector.cameras or ())} - {HEAD_CAMERA, *state.further}:
                 raise InvalidInputError(
                     f"chunk: got a request for {', '.join(sorted(absent))}, expected views that "
                     "the rollout began with; send their images with its start"
                 )
-        chunks = [starts.checked_chunk(chunk, self._description) for chunk in actions]
-        still = _stillness(states, chunks)
+        pairs = zip(states, chunks, strict=True)
+        commanded_m = np.stack([_watched_points(chunk, state.anchor) for state, chunk in pairs])
+        still = stillness(
+            torch.from_numpy(np.stack([state.still_m for state in states])),
+            torch.tensor([state.num_still for state in states]),
+            split_axis(torch.from_numpy(commanded_m), 1, (-1, FRAMES_PER_LATENT)),
+        )
         rests = still.at_rest.all(dim=1).tolist()
         each = zip(states, chunks, seeds, requested, strict=True)
         futures = iter(
@@ -266,21 +241,19 @@ class ModelWorld(BatchWorld[ModelState]):
         return stepped
 
     def _futures(
-        self, asked: Sequence[tuple[ModelState, np.ndarray, int, ReturnSelector]]
+        self, batch: Sequence[tuple[ModelState, np.ndarray, int, ReturnSelector]]
     ) -> list[tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]]:
         """Predicted images by view, maybe the last only, touch, and latents of the first images."""
-        if not asked:
+        if not batch:
             return []
-        states, chunks, seeds, requested = zip(*asked, strict=True)
+        states, chunks, seeds, requested = zip(*batch, strict=True)
         inputs = build_inputs(self._requests(states, chunks), self._model.config)
         generators = [torch.Generator().manual_seed(seed) for seed in seeds]
         noise = stack_noise([self._model.noise(inputs.num_steps, each) for each in generators])
-        wanted = any(
+        needs_all = any(
             one.steps == "all" and (one.wants(HEAD_CAMERA) or one.cameras) for one in requested
         )
-        future = self._model.predict(
-            inputs, noise, sampling=self._sampling, all_images=wanted, precision=self._precision
-        )
+        future = self._model.predict(inputs, noise, sampling=self._sampling, all_images=needs_all)
         starts.refuse_non_finite(
             "world model",
             {"image": future.images, "touch": future.tactile_kpa, "view": future.further},
@@ -334,11 +307,7 @@ class ModelWorld(BatchWorld[ModelState]):
         return pack(fields, {**arrays, "anchor": np.stack(state.anchor.as_tuple())})
 
     def restore(self, data: bytes) -> ModelState:
-        """Restore the state of a snapshot.
-
-        Raises:
-            InvalidInputError: not a snapshot of this checkpoint.
-        """
+        """Restore a snapshot; raises InvalidInputError for one of another checkpoint."""
         config = self._model.config
         max_bytes = config.num_views * MAX_SNAPSHOT_BYTES + kept_bytes(config)
         fields, arrays = starts.opened_snapshot(data, self._digest, max_bytes=max_bytes)
@@ -397,12 +366,8 @@ def open_world(
 ) -> ModelWorld | StateWorld:
     """Open the world of a checkpoint file of either kind; default: the package's own.
 
-    Args:
-        path: safetensors file; None for the one that ships with the package.
-        sampling: of a flow-matching model; a state model predicts without.
-        objects: state model that reads objects for contact geometry; None for the package's own.
-        needs_touch: refuse a model that does not predict touch, in which policies feel nothing.
-        placement: device and precision of a flow-matching model.
+    `objects` is the state model that reads objects for contact geometry; `sampling` and `placement`
+    are of flow-matching models. With `needs_touch`, models that do not predict touch are refused.
 
     Raises:
         InvalidInputError: options of sampling for a state model, guidance for a model that was
@@ -500,17 +465,6 @@ def _watched_points(
     return np.concatenate([motion.points_m, np.stack([camera_m, camera_m], axis=1)], axis=2)
 
 
-def _stillness(states: Sequence[ModelState], chunks: Sequence[np.ndarray]) -> Stillness:
-    """Latent steps of the chunks in which hands or camera move, and which are at rest."""
-    each = zip(states, chunks, strict=True)
-    commanded_m = np.stack([_watched_points(chunk, state.anchor) for state, chunk in each])
-    return stillness(
-        torch.from_numpy(np.stack([state.still_m for state in states])),
-        torch.tensor([state.num_still for state in states]),
-        split_axis(torch.from_numpy(commanded_m), 1, (-1, FRAMES_PER_LATENT)),
-    )
-
-
 def _kept_of(arrays: dict[str, np.ndarray], config: NetworkConfig) -> KeptImages | None:
     """Images kept in a snapshot, whose arrays are taken out; None if they are not as expected."""
     kept = KeptImages.none(config)
@@ -551,10 +505,7 @@ def _advance(
     imagined: tuple[dict[str, np.ndarray], np.ndarray],
     selector: ReturnSelector,
 ) -> SteppedRollout[ModelState]:
-    """New state and requested outputs, from predicted images by view (maybe the last) and touch.
-
-    The model predicts no poses: the next chunk starts from the last commanded action.
-    """
+    """New state and requested outputs; the next chunk starts from the last commanded action."""
     images, tactile_kpa = imagined
     first = 0 if selector.steps == "all" else len(chunk) - 1
     observation = Observation(

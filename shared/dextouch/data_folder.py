@@ -1,9 +1,9 @@
-"""Default data folder of all commands, and files that operating systems leave in folders."""
+"""Default data folder of all commands, small files, and those that operating systems leave."""
 
 import os
 from pathlib import Path, PurePath
 
-from dextouch.errors import InvalidInputError
+from dextouch.errors import InvalidInputError, LimitExceededError, NotFoundError, StorageError
 
 DATA_VARIABLE = "DEXTOUCH_DATA"
 # macOS, Windows, Linux desktops and network drives; compared in lower case.
@@ -58,3 +58,21 @@ def is_system_file(path: PurePath | str) -> bool:
         part.lower() in _NAMES or part.lower().startswith(_PREFIXES)
         for part in PurePath(path).parts
     )
+
+
+def read_bounded(path: Path, max_bytes: int, *, hint: str = "") -> bytes:
+    """Read a regular file of limited size; `hint` ends the message about a larger one."""
+    try:
+        if not path.exists():
+            raise NotFoundError(f"{path}: no such file")
+        if not path.is_file():
+            raise InvalidInputError(f"{path}: got a folder or device, expected a regular file")
+        with path.open("rb") as file:
+            data = file.read(max_bytes + 1)
+    except OSError as error:
+        raise StorageError(f"{path}: cannot be read: {error.strerror}") from error
+    if len(data) > max_bytes:
+        raise LimitExceededError(
+            f"{path}: got more than {max_bytes} bytes, expected at most that{hint}"
+        )
+    return data

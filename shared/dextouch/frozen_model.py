@@ -4,7 +4,7 @@ import inspect
 import re
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, GetJsonSchemaHandler
+from pydantic import BaseModel, ConfigDict, GetJsonSchemaHandler, ValidationError
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
@@ -32,6 +32,11 @@ class FrozenModel(BaseModel):
         return made
 
 
+def is_none(value: object) -> bool:
+    """For `exclude_if` of fields that are not written where they are unknown."""
+    return value is None
+
+
 def attribute_docs(model: type[BaseModel]) -> tuple[str, dict[str, str]]:
     """Docstring of a model without its attributes, and these by their names on the wire."""
     text, _, section = inspect.cleandoc(model.__doc__ or "").partition("\n\nAttributes:\n")
@@ -45,3 +50,15 @@ def attribute_docs(model: type[BaseModel]) -> tuple[str, dict[str, str]]:
 def example(**fields: Any) -> ConfigDict:  # noqa: ANN401 - JSON
     """Configuration of a model whose JSON schema shows an example with these fields."""
     return ConfigDict(json_schema_extra={"examples": [fields]})
+
+
+def first_problem(error: ValidationError) -> str:
+    """The first field that a file lacks or holds wrongly, with what was found and expected."""
+    problem = error.errors(include_url=False)[0]
+    where = ".".join(map(str, problem["loc"]))
+    message = problem["msg"].removeprefix("Value error, ")
+    if problem["type"] == "missing":
+        message = "got none, expected one"
+    elif problem["type"] != "value_error":
+        message = f"got {problem['input']!r:.80}, expected: {message}"
+    return f"{where}{': ' if where else ''}{message}"

@@ -1,9 +1,7 @@
 """Independent jobs, in processes of this machine or on a Ray cluster.
 
-`run_jobs` calls a function once for each item and yields a `Job` as each ends, with its result or
-its error: one that fails does not stop the others. A worker process that is killed costs nothing
-but time, since its job is repeated. So jobs must be repeatable: what they write is written at once
-and under a name that the item decides, as episodes are.
+Jobs must be repeatable, since that of a worker process which is killed is repeated: what they
+write is written at once and under a name that the item decides, as episodes are.
 """
 
 import multiprocessing

@@ -13,7 +13,7 @@ from dextouch.hands import (
     node_order,
 )
 from dextouch.hands.skeleton import THUMB_JOINTS
-from services.alignment.retargeting.wrist_frame import to_wrist_axes, wrist_frame
+from services.alignment.retargeting.wrist import to_wrist_axes, wrist_frame
 
 RECORDING = Path(__file__).parents[3] / "shared/data/hands/right_hand_mediapipe_first_half.npy"
 RATE_HZ = 30.0

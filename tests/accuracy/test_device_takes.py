@@ -13,7 +13,7 @@ from dextouch.geometry.rotations import rotation_angle
 from dextouch.hands import CHAINS, NODE_INDEX
 from dextouch.hands.actions import poses_from_actions
 from dextouch.hands.robot_hand import RobotHand
-from dextouch.tactile import pad_forces_n
+from dextouch.tactile import DEXTOUCH_V1
 from services.acquisition.mocks.gloves import GloveCalibration
 from services.alignment.recording_error import compare_with_truth, match_streams
 from services.pipelines.mock_takes import SESSION_SEEDS, device_options, write_by_station
@@ -174,5 +174,5 @@ def missed_by_pressing_tips_m(truth, side, at_s, Ts_world_robot, joints_rad):
     T, person = transform_from_pose(nearest("wrist")), nearest("keypoints")[:, TIPS]
     robot = RobotHand(side).fingertips_m(joints_rad)
     apart_m = apply(T, person) - apply(Ts_world_robot, robot)
-    pressing = pad_forces_n(nearest("tactile"))[:, :5] > PRESSED_N
+    pressing = DEXTOUCH_V1.pad_forces_n(nearest("tactile"))[:, :5] > PRESSED_N
     return np.linalg.norm(apart_m, axis=-1)[pressing]

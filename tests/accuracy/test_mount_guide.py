@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from services.alignment.calibration.hand_eye import BoardViews
-from services.alignment.calibration.mount_guide import mount_progress
+from services.alignment.calibration.hand_eye import BoardViews, mount_progress
 
 K = np.array([[600.0, 0.0, 320.0], [0.0, 600.0, 240.0], [0.0, 0.0, 1.0]])
 SIZE_PX = np.array([640, 480])

@@ -12,8 +12,8 @@ from services.acquisition.clock import StationClock, VirtualClock, Waiter
 from services.acquisition.mocks.faults import DeviceFaults
 from services.acquisition.mocks.gloves import GloveCalibration, mock_glove
 from services.acquisition.mocks.replay import MockSlot, ReplayStream
-from services.acquisition.path_latency import PathWatch
 from services.acquisition.supervisor import DeviceSupervisor
+from services.acquisition.watches import PathWatch
 
 SECONDS = 4.0
 PERIOD_NS = 16_666_667

@@ -5,7 +5,7 @@ import sys
 import numpy as np
 import pytest
 
-from services.alignment.retargeting.solver.smoothing import noise_of_bones, smooth_forward, smoothed
+from services.alignment.retargeting.solver.solve import noise_of_bones, smooth_forward, smoothed
 
 SIGMA_M = 1.5e-3
 

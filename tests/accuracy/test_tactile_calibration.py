@@ -9,7 +9,7 @@ from dextouch.episodes.spool import SpoolReader
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError, UnknownNameError
 from dextouch.schemas import TakePrompt
 from dextouch.streams import StreamDescriptor
-from dextouch.tactile.layout import NUM_TAXELS, expand_taxels, raw_indices, select_taxels
+from dextouch.tactile.layout import DEXTOUCH_V1, NUM_TAXELS, expand_taxels, select_taxels
 from services.acquisition.clock import VirtualClock
 from services.acquisition.devices import load_calibration
 from services.acquisition.mock_station import MockStation
@@ -54,7 +54,7 @@ class Glove:
         counts = np.rint(counts + walk + self.rng.normal(scale=self.noise, size=counts.shape))
         counts = np.clip(counts, 0, 65535).astype(np.uint16)
         for taxel, value in self.faults.items():
-            cell = int(raw_indices(side=self.side)[taxel])
+            cell = int(DEXTOUCH_V1.raw_indices(side=self.side)[taxel])
             if value is None:  # dead, but its amplifier still hisses
                 counts[:, cell] = np.rint(100 + self.rng.normal(scale=self.noise, size=num))
             else:
@@ -213,7 +213,7 @@ def test_saturated_is_what_never_leaves_the_end_of_its_scale():
     """A scale of 4000 counts ends at 0.995 of it, 3980; the rest take is among the takes."""
     glove = Glove(9)
     rest, pressed = glove.take(0.0), glove.take(5.0)
-    cells = raw_indices(side="left")
+    cells = DEXTOUCH_V1.raw_indices(side="left")
     for taxel, at_rest, under_load in (
         (100, 4000, 4000),
         (110, 3980, 3980),
@@ -363,7 +363,7 @@ def constant_touch(kpa, seconds=1.5):
 @pytest.mark.long
 def test_a_recorded_mock_glove_is_calibrated_and_its_next_take_carries_it(tmp_path, capsys):
     """Real packets with losses and bit errors, the recorder, the spool, the command, and back."""
-    cell = int(raw_indices(side="left")[100])
+    cell = int(DEXTOUCH_V1.raw_indices(side="left")[100])
     glove = DeviceFaults(bit_error_rate=1e-6, drop_probability=0.01, dead_taxels=(cell,))
     faults, prompt = FaultScript(others=glove), TakePrompt(task="calibrate", instruction="press")
 
@@ -383,7 +383,7 @@ def test_a_recorded_mock_glove_is_calibrated_and_its_next_take_carries_it(tmp_pa
     matrices = load_calibration(folder / "calibration.json")
     assert np.flatnonzero(matrices["tactile_left_taxel_state"]).tolist() == [cell]
     truth = MockGlove.seeded("left", 3)
-    good = np.delete(raw_indices(side="left"), 100)
+    good = np.delete(DEXTOUCH_V1.raw_indices(side="left"), 100)
     gain = np.array(matrices["tactile_left_gain_counts_per_kpa"])[0]
     worst = np.abs(gain / truth.gain_counts_per_kpa - 1)[good].max()
     with capsys.disabled():

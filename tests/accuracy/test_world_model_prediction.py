@@ -7,12 +7,12 @@ import pytest
 import torch
 
 from dextouch.episodes import EpisodeStore
-from dextouch.tactile.layout import taxel_areas_m2
+from dextouch.tactile.layout import DEXTOUCH_V1
 from services.twin.episodes import TakeOptions, record, write_episode
 from services.twin.settings import TwinSettings
 from services.twin.stage import Stage
 from services.world_model.checkpoints import read_checkpoint
-from services.world_model.shipped_checkpoints import paper_form_checkpoint
+from services.world_model.settings import paper_form_checkpoint
 from services.world_model.training.dataset import EpisodeArrays, WindowPosition, load_episodes
 from services.world_model.training.evaluation import evaluate_prediction, predict_all
 
@@ -106,7 +106,7 @@ def test_it_looks_before_it_feels(shipped, tmp_path):
         for episode in recorded(tmp_path, miss=True)
         for start in range(0, 65, 8)
     ]
-    areas = taxel_areas_m2()
+    areas = DEXTOUCH_V1.areas_m2
     truth_n = np.stack([(w.tactile_kpa * 1e3) @ areas for w in windows]).max(axis=1)
     future = predict_all(shipped.model, [w.request for w in windows])
     felt_n = ((future.tactile_kpa * 1e3) @ areas).max(axis=1)

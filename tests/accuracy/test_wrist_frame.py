@@ -7,7 +7,7 @@ import pytest
 
 from dextouch.geometry.rotations import vector_from_rotation
 from dextouch.hands import METACARPAL_NODES, PALM_NODES
-from services.alignment.retargeting.wrist_frame import calibrate_wrist, wrist_frame
+from services.alignment.retargeting.wrist import calibrate_wrist, wrist_frame
 from tests.unit.alignment.tracked_hands import (
     any_rotation,
     flat_hand,

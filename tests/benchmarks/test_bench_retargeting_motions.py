@@ -25,7 +25,7 @@ from dextouch.errors import InvalidInputError, LimitExceededError, NonFiniteErro
 from dextouch.hands import NODE_INDEX
 from dextouch.hands.robot_hand import RobotHand
 from services.twin.hands import HumanHand, twin_hand
-from services.twin.mjcf import scene_xml
+from services.twin.scene import scene_xml
 
 SIDES = ("left", "right")
 

@@ -8,7 +8,7 @@ from benchmarks import touch_alone
 from benchmarks.command import stage_parser
 from dextouch.episodes import EpisodeStore, split_of
 from dextouch.errors import ConflictError
-from dextouch.schemas import load_object_clicks
+from dextouch.schemas import ObjectClicks
 from services.world_model.checkpoints import read_state_checkpoint
 
 
@@ -37,7 +37,7 @@ def test_takes_without_poses_train_a_model_and_are_scored(tmp_path):
         assert not about.event_times_s
     sources = read_state_checkpoint(tmp_path / "model/model.safetensors").metadata.object_sources
     assert {"touch", "none"} < set(sources)
-    clicks = load_object_clicks(tmp_path / "objects.json").episodes
+    clicks = ObjectClicks.load(tmp_path / "objects.json").episodes
     assert len(clicks) == 3
     splits = {split_of(lab.open(name).attributes) for name in clicks}
     assert splits <= {"A", "B"}

@@ -11,8 +11,8 @@ from benchmarks.closure.benchmark import (
 from dextouch.errors import InvalidInputError, NonFiniteError
 from dextouch.geometry import invert, transform
 from dextouch.hands.robot_hand import RobotHand
-from services.alignment.retargeting import wrist_transfer
-from services.alignment.retargeting.wrist_transfer import (
+from services.alignment.retargeting import wrist
+from services.alignment.retargeting.wrist import (
     MatchedPoints,
     anchored_joints,
     fingertip_jacobians,
@@ -55,7 +55,7 @@ def test_touching_fingertips_go_where_the_humans_were(side, monkeypatch):
     human = robot_places_m(joints + turns, hand) + offset[:, None]
     points = MatchedPoints(human, robot, np.ones((NUM, 6), dtype=bool))
     shares = np.tile([1.0, 0.5, 1.0, 0.0, 0.0], (NUM, 1))
-    monkeypatch.setattr(wrist_transfer, "STAY_M2_RAD2", 1e-9)
+    monkeypatch.setattr(wrist, "STAY_M2_RAD2", 1e-9)
     led = anchored_joints(hand, joints, points, offset, shares)
     assert (led >= hand.lower_rad).all()
     assert (led <= hand.upper_rad).all()

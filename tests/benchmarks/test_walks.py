@@ -85,7 +85,7 @@ def test_the_clock_is_one_package():
 def test_a_window_passes_through_few_files(tmp_path):
     write_episode(EpisodeStore(tmp_path), num_steps=21)
     walk = walks.window_into_training(str(tmp_path))
-    assert walk.num_calls("StoredEpisode.cut") == 1
+    assert walk.num_calls("_Episode.cut") == 1
     assert len(walk.files) <= 23, walk.files
 
 

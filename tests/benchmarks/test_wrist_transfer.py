@@ -10,8 +10,8 @@ from dextouch.geometry import apply, transform
 from dextouch.geometry.rotations import rotation_from_vector
 from dextouch.hands import NODE_INDEX
 from dextouch.hands.robot_hand import RobotHand
-from services.alignment.retargeting import HandRetargeter, wrist_transfer
-from services.alignment.retargeting.wrist_transfer import (
+from services.alignment.retargeting import HandRetargeter, wrist
+from services.alignment.retargeting.wrist import (
     MatchedPoints,
     constant_offset_m,
     matched_points,
@@ -67,7 +67,7 @@ def test_what_touches_alone_decides(monkeypatch):
     points = random_points()
     forces = np.zeros((NUM, 6))
     forces[20, 1] = 5.0
-    monkeypatch.setattr(wrist_transfer, "ANCHOR_N_S", 1e-9)
+    monkeypatch.setattr(wrist, "ANCHOR_N_S", 1e-9)
     offsets = touch_offsets_m(points, forces, T_S)
     np.testing.assert_allclose(offsets[20], points.offset_m[20, 1], atol=1e-8)
     # The approach half a second earlier has the offset of the grasp.
@@ -82,8 +82,8 @@ def test_without_touch_it_is_the_constant_offset():
 
 
 def test_sums_over_neighbours_are_those_of_the_formula(monkeypatch):
-    monkeypatch.setattr(wrist_transfer, "REACH_S", 0.4)
-    monkeypatch.setattr(wrist_transfer, "ANCHOR_N_S", 0.02)
+    monkeypatch.setattr(wrist, "REACH_S", 0.4)
+    monkeypatch.setattr(wrist, "ANCHOR_N_S", 0.02)
     points = random_points(1)
     rng = np.random.default_rng(2)
     forces = rng.uniform(0, 3, (NUM, 6)) * (rng.random((NUM, 6)) > 0.5)
@@ -139,7 +139,7 @@ def test_a_touched_place_lies_where_the_humans_lay(monkeypatch):
         np.tile(points.robot_m[:1], (NUM, 1, 1)),
         points.seen,
     )
-    monkeypatch.setattr(wrist_transfer, "ANCHOR_N_S", 1e-9)
+    monkeypatch.setattr(wrist, "ANCHOR_N_S", 1e-9)
     offsets = touch_offsets_m(same, forces, T_S)
     moved = shifted_wrist(Ts, offsets)
     np.testing.assert_allclose(

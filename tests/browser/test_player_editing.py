@@ -157,10 +157,12 @@ def test_notes_are_drawn_jumped_to_and_removed(page, address, store):
     expect(page.locator(".note_mark")).to_have_count(1)
     (note,) = store.notes("raw", kind="recording").notes
     assert (note.start_ns, note.author) == (89 * 33_333_333, "p-7")
+    expect(dialog).to_be_hidden()
+    at_note = page.locator("#clock").get_attribute("title")
     page.keyboard.press("Home")
-    at_start = page.locator("#clock").get_attribute("title")
+    expect(page.locator("#clock")).not_to_have_attribute("title", at_note)
     page.locator("#note_rows button").first.click()
-    expect(page.locator("#clock")).not_to_have_attribute("title", at_start)
+    expect(page.locator("#clock")).to_have_attribute("title", at_note)
     page.get_by_label("remove note 1").click()
     expect(page.locator("#notes")).to_be_hidden()
     assert page.title() == "kept"

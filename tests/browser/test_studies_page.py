@@ -1,6 +1,7 @@
 """An operator reads a study in a real browser: the tables show what scipy and plain loops count."""
 
 import re
+from urllib.parse import parse_qs, urlsplit
 
 import pytest
 from playwright.sync_api import expect
@@ -171,10 +172,22 @@ def test_disagreements_come_first_and_every_cell_leads_to_its_rollouts(opened, r
 @pytest.mark.slow
 def test_rollouts_in_the_dashboards_store_are_linked(page, address, root):
     finish(root)
-    page.route("**/v1/episode_store/episodes/**", lambda route: route.fulfill(json={}))
+    requests = []
+
+    def stored(route):
+        requests.append(route.request.url)
+        ids = parse_qs(urlsplit(route.request.url).query)["id"]
+        route.fulfill(json={"items": [{"id": one} for one in ids if "-real-" in one]})
+
+    page.route("**/v1/episode_store/**", stored)
     page.goto(f"{address}/studies/touch")
-    link = page.locator("#rollouts tbody tr").first.get_by_role("link", name="Play real")
+    row = page.locator("#rollouts tbody tr").first
+    link = row.get_by_role("link", name="Play real")
     expect(link).to_have_attribute("href", re.compile("^/episodes/episode/rollout-.*-real-"))
+    # What is not stored is neither linked nor requested on its own, which logged a 404 each.
+    expect(row.get_by_role("link", name=re.compile("^Play (?!real)"))).to_have_count(0)
+    assert len(requests) == 1
+    assert "/catalog/items?kind=episode&" in requests[0]
 
 
 @pytest.mark.slow

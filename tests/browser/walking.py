@@ -13,7 +13,7 @@ import numpy as np
 import zarr
 from playwright.sync_api import expect
 
-from dextouch.tactile.layout import colour, hand_canvas
+from dextouch.tactile.layout import DEXTOUCH_V1, colour
 
 DEXTOUCH = (sys.executable, "-m", "services.cli.main")
 START_LIMIT_S = 300
@@ -118,7 +118,7 @@ def check_moments(page, store, episode_id, shares):
     """The player at these shares of an episode, one nanosecond before and at samples."""
     episode = zarr.open_group(store / "episodes" / episode_id, mode="r")
     stamps = episode["camera_head_t_ref_ns"][:]
-    size = list(hand_canvas(np.zeros(320, "f4"), side="right").shape)
+    size = list(DEXTOUCH_V1.hand_canvas(np.zeros(320, "f4"), side="right").shape)
     address = page.evaluate("() => location.origin")
     for number, share in enumerate(shares):
         t_ns = int(stamps[int(share * len(stamps))]) - number % 2
@@ -152,6 +152,6 @@ def _check_moment(shown, episode, t_ns):
     assert len(touching_kpa) > 0
     said = f"{len(touching_kpa)} taxels in contact, peak {touching_kpa.max():.0f} kPa"
     assert said in shown["touch"]
-    reds = hand_canvas(colour(pressures_kpa)[:, 0].astype("f4"), side="right").ravel()
-    pressed = hand_canvas(pressures_kpa, side="right").ravel() >= 2.0
+    reds = DEXTOUCH_V1.hand_canvas(colour(pressures_kpa)[:, 0].astype("f4"), side="right").ravel()
+    pressed = DEXTOUCH_V1.hand_canvas(pressures_kpa, side="right").ravel() >= 2.0
     assert np.abs(np.array(shown["reds"]) - reds)[pressed].max() <= 3

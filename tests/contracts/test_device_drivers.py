@@ -24,7 +24,7 @@ from services.acquisition.mock_station import build_mocks
 from services.acquisition.mocks.faults import DeviceFaults, FaultScript
 from services.acquisition.mocks.pattern import pattern_streams
 from services.acquisition.mocks.replay import PacketSource, ReplayStream
-from services.acquisition.mocks.trackers import (
+from services.acquisition.mocks.trackers_and_cameras import (
     BridgeFingerTrackerSource,
     BridgePort,
     BridgePoseSource,

@@ -13,7 +13,7 @@ from services.acquisition.health.monitor import TICK_NS, HealthMonitor
 from services.acquisition.mock_station import build_mocks
 from services.acquisition.mocks.faults import FaultScript
 from services.acquisition.mocks.pattern import pattern_calibration, pattern_streams
-from services.acquisition.mocks.trackers import FingerTrackerSource
+from services.acquisition.mocks.trackers_and_cameras import FingerTrackerSource
 from services.acquisition.settings import MockLinks
 from services.acquisition.supervisor import DeviceSupervisor
 

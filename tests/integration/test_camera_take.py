@@ -16,13 +16,12 @@ from dextouch.schemas import RecordingAttributes, SaveTake, TakePrompt
 from dextouch.streams import StreamDescriptor
 from services.acquisition.clock import VirtualClock
 from services.acquisition.mock_station import MockStation
-from services.acquisition.mocks.cameras_and_robot import video_camera
 from services.acquisition.mocks.faults import DeviceFaults, FaultScript
 from services.acquisition.mocks.replay import MockSlot, ReplayStream
+from services.acquisition.mocks.trackers_and_cameras import video_camera
 from services.acquisition.settings import MockLinks, SpoolSafety
 from services.acquisition.station import Station
-from services.acquisition.take import Take
-from services.acquisition.take_check import TakeWatch
+from services.acquisition.take import Take, TakeWatch
 from services.acquisition.uploader import Uploader
 from services.alignment.synchronization.stream_clock import time_stream
 from services.episode_store.app import create_app

@@ -9,7 +9,7 @@ import pytest
 from dextouch.episodes.spool import SpoolReader
 from dextouch.schemas import SaveTake, TakePrompt
 from dextouch.streams import StreamDescriptor
-from services.acquisition import path_latency
+from services.acquisition import watches
 from services.acquisition.clock import StationClock
 from services.acquisition.mocks.faults import DeviceFaults
 from services.acquisition.mocks.gloves import GloveCalibration, mock_glove
@@ -23,7 +23,7 @@ PROMPT = TakePrompt(task="stand_bottle", instruction="stand the bottle up")
 
 @pytest.fixture
 def station(tmp_path, monkeypatch):
-    monkeypatch.setattr(path_latency, "PERIOD_NS", 100_000_000)
+    monkeypatch.setattr(watches, "PERIOD_NS", 100_000_000)
     descriptor = StreamDescriptor(
         name="tactile_left",
         kind="tactile",

@@ -11,9 +11,9 @@ import structlog
 from dextouch.clients import EpisodeStoreClient
 from dextouch.schemas import TakePrompt
 from services.acquisition.clock import VirtualClock
-from services.acquisition.memory import keep_for_life
 from services.acquisition.mock_station import MockStation
 from services.acquisition.mocks.faults import DeviceFaults, FaultScript
+from services.acquisition.recorder import keep_for_life
 from services.acquisition.settings import MockLinks
 from services.acquisition.uploader import Uploader, recover_spool
 from tests.integration.recording_streams import human_streams, robot_streams

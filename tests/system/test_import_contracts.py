@@ -38,7 +38,7 @@ OFFENCES = [
         "import services.alignment.jobs",
     ),
     ("redis only in dextouch.serving", "services/dashboard/feeds.py", "import redis"),
-    ("OpenCV only in calibration", "services/alignment/retargeting/wrist_frame.py", "import cv2"),
+    ("OpenCV only in calibration", "services/alignment/retargeting/wrist.py", "import cv2"),
     (
         "Commands over pipelines, which join services",
         "services/pipelines/twin_geometry.py",

@@ -24,7 +24,7 @@ from dextouch.schemas import (
 from dextouch.serving import configure_logging
 from dextouch.streams import StreamDescriptor
 from services.acquisition.settings import AcquisitionSettings
-from services.alignment.station_calibration.run_status import Answer, RunRequest
+from services.alignment.station_calibration.runs import Answer, RunRequest
 from services.cli.main import main
 from services.cli.up_settings import UpSettings
 from services.dashboard.pages import load_tasks

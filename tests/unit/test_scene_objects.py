@@ -6,7 +6,7 @@ import cv2
 import pytest
 
 from dextouch.errors import InvalidInputError, NotFoundError
-from dextouch.schemas import load_scene_objects
+from dextouch.schemas import SceneObjects
 from dextouch.schemas.scene_objects import DICTIONARY_SIZES
 
 FLAT = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]
@@ -24,7 +24,7 @@ def described(**changes):
 def load(tmp_path, content):
     path = tmp_path / "objects.json"
     path.write_text(content if isinstance(content, str) else json.dumps(content))
-    return load_scene_objects(path)
+    return SceneObjects.load(path)
 
 
 def test_a_file_gives_the_objects_of_each_task(tmp_path):
@@ -55,7 +55,7 @@ def test_a_wrong_file_is_refused_with_the_place(tmp_path, content, says):
 
 def test_a_missing_file_is_named(tmp_path):
     with pytest.raises(NotFoundError, match=r"nothing\.json"):
-        load_scene_objects(tmp_path / "nothing.json")
+        SceneObjects.load(tmp_path / "nothing.json")
 
 
 @pytest.mark.parametrize(

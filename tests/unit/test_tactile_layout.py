@@ -17,7 +17,7 @@ def test_select_inverts_expand(side):
     raw = layout.expand_taxels(taxels, side=side)
     assert raw.shape == (2, 360)
     np.testing.assert_array_equal(layout.select_taxels(raw, side=side), taxels)
-    assert len(set(layout.raw_indices(side=side).tolist())) == 320
+    assert len(set(layout.DEXTOUCH_V1.raw_indices(side=side).tolist())) == 320
 
 
 # Scan row and column of some taxels of the right glove, counted by hand from the wiring in
@@ -106,14 +106,14 @@ def test_the_cells_around_the_taxels_are_zero_and_the_type_stays():
 
 def test_taxels_of_the_palm_are_larger_than_those_of_the_fingertips():
     """4 by 4 mm, and 6 by 5 mm in the palm."""
-    areas = layout.taxel_areas_m2()
+    areas = layout.DEXTOUCH_V1.areas_m2
     np.testing.assert_allclose(areas[:80], 16e-6)
     np.testing.assert_allclose(areas[80:], 30e-6)
 
 
 def test_left_glove_is_wired_as_the_mirror_image():
-    left = layout.raw_indices(side="left").reshape(-1)
-    right = layout.raw_indices(side="right").reshape(-1)
+    left = layout.DEXTOUCH_V1.raw_indices(side="left").reshape(-1)
+    right = layout.DEXTOUCH_V1.raw_indices(side="right").reshape(-1)
     np.testing.assert_array_equal(left // 20, right // 20)
     np.testing.assert_array_equal(left % 20, 19 - right % 20)
 
@@ -139,9 +139,9 @@ def test_contact_threshold_is_two_kilopascal():
 
 def test_hand_canvas_holds_every_taxel_once_and_mirrors():
     taxels = np.arange(1, 321, dtype=np.float32)
-    right = layout.hand_canvas(taxels, side="right")
+    right = layout.DEXTOUCH_V1.hand_canvas(taxels, side="right")
     assert sorted(right[np.isfinite(right)].tolist()) == taxels.tolist()
-    left = layout.hand_canvas(taxels, side="left")
+    left = layout.DEXTOUCH_V1.hand_canvas(taxels, side="left")
     np.testing.assert_array_equal(left, right[:, ::-1])
     rgb = layout.colour(right)
     assert rgb.shape == (28, 26, 3)
@@ -157,6 +157,6 @@ def test_pads_of_other_shapes_are_not_joined(shape):
 @pytest.mark.parametrize("unit", ["N", "kPa"])
 def test_facts_of_a_layout_cannot_be_changed(unit):
     glove = small_layout(unit=unit)
-    for fact in (layout.taxel_areas_m2(), glove.areas_m2, glove.nominal_kpa_per_unit):
+    for fact in (layout.DEXTOUCH_V1.areas_m2, glove.areas_m2, glove.nominal_kpa_per_unit):
         with pytest.raises(ValueError, match="read-only"):
             fact[0] = 1.0

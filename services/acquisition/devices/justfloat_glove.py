@@ -12,19 +12,12 @@ import numpy as np
 from jaxtyping import Float32
 from pydantic import Field, model_validator
 
-from dextouch.errors import DeviceError, InvalidInputError
+from dextouch.errors import DeviceError
 from dextouch.streams import ClockCapabilities, Sample
 from dextouch.tactile.layout import Side, TactileLayout
 from services.acquisition.clock import StationClock
 from services.acquisition.devices.kinds import DeviceKind, GloveSettings, serial_transport
-from services.acquisition.drivers.base import (
-    CellLayout,
-    Driver,
-    StreamDecoder,
-    check_raw_cells,
-    glove_stream,
-    raw_unit,
-)
+from services.acquisition.drivers import base
 from services.acquisition.drivers.packets import PortionedSearch
 
 TAIL = b"\x00\x00\x80\x7f"
@@ -55,11 +48,7 @@ class JustFloatFrames(PortionedSearch[bytes]):
         self._foreign = (0, 0)
 
     def _search(self, data: bytes) -> tuple[list[bytes], int]:
-        """Payloads, and how many bytes are done with.
-
-        Raises:
-            DeviceError: packets of another length, three in a row.
-        """
+        """Payloads, and how many bytes are done with; DeviceError after three of another length."""
         found: list[bytes] = []
         position = 0
         while True:
@@ -132,18 +121,12 @@ class JustFloatFrames(PortionedSearch[bytes]):
             )
 
 
-class JustFloatGloveDecoder(StreamDecoder[bytes]):
+class JustFloatGloveDecoder(base.StreamDecoder[bytes]):
     """Decodes one glove's byte stream to float32 [num_values], without stamp and number.
 
-    Without a sequence, losses cannot be counted.
-
-    Args:
-        side: of the glove; the packets do not contain it.
-        num_values: float32s of a packet (known versions send 401, 415 or 615).
-        full_scale: the largest reading; packets with larger ones are held back.
-        rate_hz: nominal rate; the stream has no device clock.
-        label: of a further glove of this hand.
-        layout: of its taxels; None where only the calibration maps them to those of `dextouch_v1`.
+    Without a sequence, losses cannot be counted. Known versions send 401, 415 or 615 values;
+    packets with larger ones than `full_scale` are held back. `label` is that of a further glove of
+    this hand, `layout` None where only the calibration maps its taxels to those of `dextouch_v1`.
     """
 
     def __init__(
@@ -157,11 +140,11 @@ class JustFloatGloveDecoder(StreamDecoder[bytes]):
         layout: TactileLayout | None = None,
     ) -> None:
         if layout is not None:
-            check_raw_cells(layout, num_values, device=f"glove_{side}")
+            base.check_raw_cells(layout, num_values, device=f"glove_{side}")
         frames = JustFloatFrames(num_values, full_scale)
         # The device sends neither its unit nor its time.
-        unit = "raw" if layout is None else raw_unit(layout)
-        descriptor = glove_stream(
+        unit = "raw" if layout is None else base.raw_unit(layout)
+        descriptor = base.glove_stream(
             side,
             label,
             shape=(num_values,),
@@ -172,7 +155,7 @@ class JustFloatGloveDecoder(StreamDecoder[bytes]):
             capabilities=ClockCapabilities(),
         )
         super().__init__(descriptor, frames)
-        self.cells = CellLayout(full_scale, grid=None)
+        self.cells = base.CellLayout(full_scale, grid=None)
 
     def _sample(self, packet: bytes, t_host_ns: int) -> Sample:
         return Sample(t_host_ns, np.frombuffer(packet, _VALUE))
@@ -200,12 +183,7 @@ def are_readings(values: Float32[np.ndarray, " n"], largest_bits: int) -> bool:
 class JustFloatGloveSettings(GloveSettings):
     """Settings of a glove on a serial port whose packets do not describe themselves.
 
-    Each must be set where no `layout` says it.
-
-    Attributes:
-        num_values: float32s of a packet.
-        full_scale: the largest reading.
-        rate_hz: nominal rate.
+    Number of float32s, largest reading and nominal rate must be set where no `layout` says them.
     """
 
     kind: Literal["justfloat_glove"] = "justfloat_glove"
@@ -225,18 +203,15 @@ class JustFloatGloveSettings(GloveSettings):
         return self
 
 
-def build(settings: JustFloatGloveSettings, clock: StationClock) -> Driver:
+def build(settings: JustFloatGloveSettings, clock: StationClock) -> base.Driver:
     """The driver of one glove."""
     transport = serial_transport(settings, device=settings.device)
     layout = settings.read_layout()
 
     def setting(name: str, of_layout: str) -> float:
         value = getattr(settings, name)
-        if value is None and layout is not None:
-            value = getattr(layout, of_layout)
-        if value is None:
-            raise InvalidInputError(f"{settings.device}: got no {name}, expected one or a layout")
-        return float(value)
+        # Validated: without a layout there is a value.
+        return float(getattr(layout, of_layout) if value is None else value)
 
     decoder = JustFloatGloveDecoder(
         settings.side,
@@ -246,7 +221,7 @@ def build(settings: JustFloatGloveSettings, clock: StationClock) -> Driver:
         label=settings.label,
         layout=layout,
     )
-    return Driver(settings.device, transport=transport, decoder=decoder, clock=clock)
+    return base.Driver(settings.device, transport=transport, decoder=decoder, clock=clock)
 
 
 KIND = DeviceKind(

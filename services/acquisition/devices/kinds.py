@@ -1,8 +1,6 @@
 """Kinds of devices: what a kind is, how it is found by its name, and the drivers of a station.
 
-Kinds of this package and of others are entry points of one group and are loaded by the same code,
-when a station names them. Every other module of this package is one of ours, with or without an
-installation: it holds `KIND`.
+Every other module of this package holds the `KIND` of one of ours, with or without an installation.
 """
 
 import pkgutil

@@ -42,11 +42,8 @@ class NumbersDecoder(BridgeDecoder):
     """Samples of one declared stream, its numbers as the bridge sends them.
 
     NaN is kept, except in poses: one that is not finite, or whose quaternion is not of unit length,
-    is counted as `refused`.
-
-    Args:
-        descriptor: of the stream; its shape says how many numbers a sample has.
-        serial_number: of the source; the bridge's only one if None.
+    is counted as `refused`. The descriptor's shape says how many numbers a sample has; without a
+    serial number the source is the bridge's only one.
     """
 
     def __init__(self, descriptor: StreamDescriptor, *, serial_number: str | None = None) -> None:

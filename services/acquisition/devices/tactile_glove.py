@@ -17,17 +17,10 @@ from dextouch.streams import ClockCapabilities, Sample, StreamDescriptor
 from dextouch.tactile.layout import DEXTOUCH_V1, Side, TactileLayout
 from services.acquisition.clock import StationClock
 from services.acquisition.devices.kinds import DeviceKind, GloveSettings, serial_transport
-from services.acquisition.drivers.base import (
-    Driver,
-    Readings,
-    StreamDecoder,
-    check_packet,
-    glove_stream,
-    hand_name,
-    raw_unit,
-)
+from services.acquisition.drivers import base
 from services.acquisition.drivers.packets import (
     SEQUENCE_MODULUS,
+    SOURCE_NAMES,
     SOURCES,
     VERSION,
     Packet,
@@ -119,10 +112,8 @@ def parse_identity(body: bytes, source: int) -> GloveIdentity:
         serial_number = serial_bytes.rstrip(b"\0").decode("ascii")
     except UnicodeDecodeError as error:
         raise PacketError(f"glove identity: got {serial_bytes!r}, expected ASCII") from error
-    sides = {number: name for name, number in SOURCES.items()}
-    return GloveIdentity(
-        serial_number, ".".join(map(str, firmware)), sides.get(source, str(source))
-    )
+    side = SOURCE_NAMES.get(source, str(source))
+    return GloveIdentity(serial_number, ".".join(map(str, firmware)), side)
 
 
 def encode_identity(serial_number: str, firmware: tuple[int, int, int]) -> bytes:
@@ -164,31 +155,27 @@ def glove_descriptor(
     about = DEXTOUCH_V1 if layout is None else layout
     if about.full_scale > FULL_SCALE_COUNTS:
         raise InvalidInputError(
-            f"glove_{hand_name(side, label)}: got layout {about.name!r} with full_scale "
+            f"glove_{base.hand_name(side, label)}: got layout {about.name!r} with full_scale "
             f"{about.full_scale:g}, expected at most {FULL_SCALE_COUNTS}, since its packets hold "
             "16 bits a cell"
         )
-    return glove_stream(
+    return base.glove_stream(
         side,
         label,
         shape=(about.num_raw_cells,),
         dtype="uint16",
-        unit=raw_unit(about),
+        unit=base.raw_unit(about),
         nominal_rate_hz=about.nominal_rate_hz,
         layout=layout,
         capabilities=ClockCapabilities(crc=True, sequence=True, device_time=True),
     )
 
 
-class TactileGloveDecoder(StreamDecoder[Packet]):
+class TactileGloveDecoder(base.StreamDecoder[Packet]):
     """Decodes one glove's byte stream to uint16 counts [cells] in raw scan order.
 
-    Args:
-        side: which glove it must be; None takes any.
-        on_reply: takes each reply to a command with its arrival; without it replies are passed
-            over.
-        label: of a further glove of this hand.
-        layout: of its taxels; None of `dextouch_v1`.
+    Without a side it takes any glove. `on_reply` takes each reply to a command with its arrival.
+    `label` is that of a further glove of this hand, `layout` None of a `dextouch_v1`.
     """
 
     def __init__(
@@ -209,7 +196,7 @@ class TactileGloveDecoder(StreamDecoder[Packet]):
         )
         super().__init__(descriptor, packets)
         self._side: Side | None = side
-        self._device = f"glove_{'any' if side is None else hand_name(side, label)}"
+        self._device = f"glove_{'any' if side is None else base.hand_name(side, label)}"
         self._on_reply = on_reply
 
     def _sample(self, packet: Packet, t_host_ns: int) -> Sample | None:
@@ -217,7 +204,7 @@ class TactileGloveDecoder(StreamDecoder[Packet]):
             if self._on_reply is not None:
                 self._on_reply(packet, t_host_ns)
             return None
-        check_packet(packet, device=self._device, source=self._side)
+        base.check_packet(packet, device=self._device, source=self._side)
         counts = np.frombuffer(packet.payload, _COUNT)
         return Sample(t_host_ns, counts, packet.t_device_ns, packet.sequence)
 
@@ -235,19 +222,12 @@ class Answer(NamedTuple):
     t_answered_host_ns: int
 
 
-class TactileGlove(Driver):
+class TactileGlove(base.Driver):
     """Reads one glove and asks it things.
 
     Every opening asks who it is: a glove of another serial number or of the other hand is
-    refused by name before any sample is taken from it.
-
-    Args:
-        side: which hand's glove it must be.
-        transport: where it is.
-        clock: of the station.
-        serial_number: that it must have; None takes any.
-        label: of a further glove of this hand.
-        layout: of its taxels; None of `dextouch_v1`.
+    refused by name before any sample is taken from it. Without a serial number any is taken.
+    `label` is that of a further glove of this hand, `layout` None of a `dextouch_v1`.
     """
 
     def __init__(
@@ -261,7 +241,7 @@ class TactileGlove(Driver):
         layout: TactileLayout | None = None,
     ) -> None:
         decoder = TactileGloveDecoder(side, on_reply=self._accept, label=label, layout=layout)
-        name = f"glove_{hand_name(side, label)}"
+        name = f"glove_{base.hand_name(side, label)}"
         super().__init__(name, transport=transport, decoder=decoder, clock=clock)
         self._side: Side = side
         self._serial_number = serial_number
@@ -269,7 +249,7 @@ class TactileGlove(Driver):
         # The requests under way, and the replies to them with their arrivals.
         self._asked: dict[int, Reply] = {}
         self._writing = threading.Lock()
-        self._held: Readings = {}
+        self._held: base.Readings = {}
         self._reader: int | None = None
 
     def open(self) -> None:
@@ -283,7 +263,7 @@ class TactileGlove(Driver):
         super().open()
         self._check(self.identify())
 
-    def read(self) -> Readings:
+    def read(self) -> base.Readings:
         """New samples by stream; those that came during a request of this thread go first."""
         self._reader = threading.get_ident()
         if self._held:

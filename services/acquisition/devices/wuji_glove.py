@@ -13,13 +13,7 @@ from dextouch.streams import ClockCapabilities, Sample
 from dextouch.tactile.layout import Side, TactileLayout
 from services.acquisition.clock import StationClock
 from services.acquisition.devices.kinds import DeviceKind, GloveSettings, serial_transport
-from services.acquisition.drivers.base import (
-    CellLayout,
-    Driver,
-    StreamDecoder,
-    check_raw_cells,
-    glove_stream,
-)
+from services.acquisition.drivers import base
 from services.acquisition.drivers.packets import FrameSearch
 
 MARK = b"\xaa\x55"
@@ -96,21 +90,21 @@ class WujiFrames(FrameSearch[WujiPacket]):
         return last_ms is not None and (time_ms - last_ms) % (1 << TIME_BITS) >= 1 << TIME_BITS - 1
 
 
-class WujiGloveDecoder(StreamDecoder[WujiPacket]):
+class WujiGloveDecoder(base.StreamDecoder[WujiPacket]):
     """Decodes one glove's byte stream to float32 [768] of full scale, 0 … 1, row by row.
 
     Cells that the glove has not are NaN, as it sends them. Without a `layout` only the calibration
     maps them to the taxels of `dextouch_v1`.
     """
 
-    cells = CellLayout(FULL_SCALE, GRID)
+    cells = base.CellLayout(FULL_SCALE, GRID)
 
     def __init__(
         self, side: Side, *, label: str | None = None, layout: TactileLayout | None = None
     ) -> None:
         if layout is not None:
             _check_layout(layout, device=f"glove_{side}")
-        descriptor = glove_stream(
+        descriptor = base.glove_stream(
             side,
             label,
             shape=(NUM_CELLS,),
@@ -142,12 +136,8 @@ class WujiGloveDecoder(StreamDecoder[WujiPacket]):
 
 
 def _check_layout(layout: TactileLayout, *, device: str) -> None:
-    """Check that a layout has the cells, unit and full scale of what the glove sends.
-
-    Raises:
-        InvalidInputError: it has others, by which conversion would make wrong pressures.
-    """
-    check_raw_cells(layout, NUM_CELLS, device=device)
+    """Refuse a layout by whose cells, unit or full scale conversion would make wrong pressures."""
+    base.check_raw_cells(layout, NUM_CELLS, device=device)
     if (layout.unit, layout.full_scale) != (UNIT, FULL_SCALE):
         raise InvalidInputError(
             f"{device}: got layout {layout.name!r} with unit {layout.unit!r} and full_scale "
@@ -174,12 +164,12 @@ class WujiGloveSettings(GloveSettings):
     kind: Literal["wuji_glove"] = "wuji_glove"
 
 
-def build(settings: WujiGloveSettings, clock: StationClock) -> Driver:
+def build(settings: WujiGloveSettings, clock: StationClock) -> base.Driver:
     """The driver of one glove."""
     transport = serial_transport(settings, device=settings.device)
     layout = settings.read_layout()
     decoder = WujiGloveDecoder(settings.side, label=settings.label, layout=layout)
-    return Driver(settings.device, transport=transport, decoder=decoder, clock=clock)
+    return base.Driver(settings.device, transport=transport, decoder=decoder, clock=clock)
 
 
 KIND = DeviceKind(

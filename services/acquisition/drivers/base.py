@@ -13,6 +13,7 @@ from dextouch.tactile.layout import Side, TactileLayout
 from services.acquisition.clock import StationClock
 from services.acquisition.drivers.images import ImageQuality
 from services.acquisition.drivers.packets import (
+    SOURCE_NAMES,
     SOURCES,
     VERSION,
     DecoderStatistics,
@@ -234,8 +235,7 @@ def check_packet(packet: Packet, *, device: str, source: str | None) -> None:
             event="wrong_version",
         )
     if source is not None and packet.source != SOURCES[source]:
-        names = {number: name for name, number in SOURCES.items()}
-        got = names.get(packet.source, str(packet.source))
+        got = SOURCE_NAMES.get(packet.source, str(packet.source))
         raise DeviceError(
             f"{device}: says it is {got!r}, expected {source!r}; is the wrong one plugged in?",
             device=device,

@@ -23,6 +23,7 @@ MAGIC_SIZE = 4
 SEQUENCE_BITS = 32
 SEQUENCE_MODULUS = 1 << SEQUENCE_BITS
 SOURCES = {"none": 0, "left": 1, "right": 2, "head": 3}
+SOURCE_NAMES = {number: name for name, number in SOURCES.items()}
 
 
 @dataclass

@@ -262,9 +262,9 @@ class BridgeDecoder(StreamDecoder[Packet]):
             raise self._error(
                 f"the bridge is a {hello.kind}, expected a {self._kind}", "wrong_hello"
             )
-        wanted = self._serial_number
-        if wanted is not None:
-            found = [d for d in hello.devices if d.serial_number == wanted]
+        serial_number = self._serial_number
+        if serial_number is not None:
+            found = [d for d in hello.devices if d.serial_number == serial_number]
         else:
             found = [d for d in hello.devices if d.source == self._source]
         if len(found) > 1:
@@ -272,9 +272,9 @@ class BridgeDecoder(StreamDecoder[Packet]):
                 f"several devices are {self._source!r}; set serial_number to one of: {present}",
                 "ambiguous_device",
             )
-        if not found and wanted is not None:
+        if not found and serial_number is not None:
             raise self._error(
-                f"the bridge has no device {wanted!r}; present: {present}", "absent_device"
+                f"the bridge has no device {serial_number!r}; present: {present}", "absent_device"
             )
         if not found or found[0].source != self._source:
             raise self._error(

@@ -1,8 +1,7 @@
 """Root causes behind a station's findings: one cause with one advice for everything it explains.
 
-An overloaded computer delays all streams, and a hub that fails takes all of its devices with it;
-the findings of the streams then contradict each other. Causes are sought from the widest to the
-narrowest, and each takes the findings that it explains; what remains is a device's own fault.
+Causes are sought from the widest to the narrowest, and each takes the findings that it explains;
+what remains is a device's own fault.
 """
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence

@@ -163,10 +163,10 @@ class HealthHistory:
         nan = np.nan
         values = [[streams[name].get(key, nan) for key in STREAM_SERIES] for name in self.streams]
         with self._lock:
-            place = self._num_added % len(self._t_ns)
-            self._t_ns[place] = t_ns
-            self._station[:, place] = [station.get(key, nan) for key in STATION_SERIES]
-            self._values[:, :, place] = np.reshape(values, self._values.shape[:2])
+            ring_index = self._num_added % len(self._t_ns)
+            self._t_ns[ring_index] = t_ns
+            self._station[:, ring_index] = [station.get(key, nan) for key in STATION_SERIES]
+            self._values[:, :, ring_index] = np.reshape(values, self._values.shape[:2])
             self._num_added += 1
 
     def rows(
@@ -184,10 +184,10 @@ class HealthHistory:
         indices = [self.streams.index(name) for name in chosen]
         with self._lock:
             first = max(0, self._num_added - len(self._t_ns))
-            places = np.arange(first, self._num_added) % len(self._t_ns)
-            places = places[self._t_ns[places] >= since_ns][-limit:]
-            values = self._values[indices][:, :, places]
-            return Rows(self._t_ns[places], self._station[:, places], values, chosen)
+            ring_indices = np.arange(first, self._num_added) % len(self._t_ns)
+            ring_indices = ring_indices[self._t_ns[ring_indices] >= since_ns][-limit:]
+            values = self._values[indices][:, :, ring_indices]
+            return Rows(self._t_ns[ring_indices], self._station[:, ring_indices], values, chosen)
 
     def begin_take(self, recording_id: str, start_ns: int) -> None:
         """A take has begun."""

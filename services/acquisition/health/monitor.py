@@ -8,10 +8,14 @@ from dextouch import schemas
 from dextouch.streams import BODIES, StreamDescriptor
 from services.acquisition.clock import PeriodicCall, StationClock
 from services.acquisition.drivers.base import Driver
-from services.acquisition.follow_watch import FollowWatch
-from services.acquisition.glove_record import glove_record, is_ours
 from services.acquisition.health.causes import SIMULATED_ADVICE, find_causes
-from services.acquisition.health.cells import TaxelCheck, cell_judge, refused_taxels
+from services.acquisition.health.cells import (
+    TaxelCheck,
+    cell_judge,
+    glove_record,
+    is_ours,
+    refused_taxels,
+)
 from services.acquisition.health.clock import ClockCheck, CountingCheck
 from services.acquisition.health.codes import CODES, SEVERITY
 from services.acquisition.health.evaluation import (
@@ -41,8 +45,8 @@ from services.acquisition.health.streams import (
     SampleQueue,
     TrackingCheck,
 )
-from services.acquisition.path_latency import PathWatch
 from services.acquisition.supervisor import DeviceSupervisor
+from services.acquisition.watches import FollowWatch, PathWatch
 
 TICK_NS = 100_000_000
 PERIOD_NS = 1_000_000_000

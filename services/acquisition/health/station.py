@@ -13,7 +13,7 @@ import numpy as np
 from dextouch.schemas import Matrix
 from dextouch.streams import TAXEL_UNIT, StreamDescriptor
 from services.acquisition.clock import HostWatch, StationClock
-from services.acquisition.glove_record import is_ours
+from services.acquisition.health.cells import is_ours
 from services.acquisition.health.evaluation import (
     WINDOW_NS,
     CountWindow,
@@ -21,8 +21,8 @@ from services.acquisition.health.evaluation import (
     Finding,
     Rolling,
 )
-from services.acquisition.path_latency import PathWatch
 from services.acquisition.supervisor import DeviceSupervisor
+from services.acquisition.watches import PathWatch
 
 MIN_RATE_SPAN_NS = 900_000_000
 CALIBRATED_AT = "calibrated_at_unix_s"
@@ -133,12 +133,12 @@ class PathCheck:
         evaluation.figures["path_latency_sigma_seconds"] = measured.sigma_ns * 1e-9
         if self._calibrated_ns is not None:
             sigma_ns = math.hypot(measured.sigma_ns, self._calibrated_sigma_ns)
-            apart = abs(measured.latency_ns - self._calibrated_ns) / sigma_ns
+            sigmas = abs(measured.latency_ns - self._calibrated_ns) / sigma_ns
             text = (
                 f"its path delay is {measured.latency_ns * 1e-6:.1f} ms by its replies and "
-                f"{self._calibrated_ns * 1e-6:.1f} ms by the calibration, {apart:.1f} sigma apart"
+                f"{self._calibrated_ns * 1e-6:.1f} ms by the calibration, {sigmas:.1f} sigma apart"
             )
-            evaluation.judge("latency_calibration", apart, text)
+            evaluation.judge("latency_calibration", sigmas, text)
 
 
 def judge_uploads(evaluation: Evaluation, refused: Mapping[str, str]) -> None:
@@ -179,14 +179,10 @@ class HostCheck:
     The 90th percentile of 10 s: a single stop of the process, such as a laptop's sleep, is none.
     """
 
-    def __init__(
-        self,
-        load: Callable[[], tuple[float, int]] | None = None,
-        cpu_times: Callable[[], tuple[int, int] | None] | None = None,
-    ) -> None:
-        self._load = load or _load
+    def __init__(self, load: Callable[[], tuple[float, int]] | None = None) -> None:
+        self._load = load or (lambda: (os.getloadavg()[0], os.cpu_count() or 1))
         self._late = Rolling()
-        self._cpu_times = cpu_times or _cpu_times
+        self._cpu_times = _cpu_times
         # The times of the last 10 s, whose ends give the share that was used.
         self._times: deque[tuple[int, int, int]] = deque()
 
@@ -223,10 +219,6 @@ class HostCheck:
                 evaluation.figures[figure] = (times[0] - used) / (times[1] - ticks)
 
 
-def _load() -> tuple[float, int]:
-    return os.getloadavg()[0], os.cpu_count() or 1
-
-
 def _cpu_times(stat: Path = Path("/proc/stat")) -> tuple[int, int] | None:
     """Ticks of all processors together, from the first line of /proc/stat (proc(5))."""
     try:
@@ -247,11 +239,11 @@ class HostClockCheck:
     def __call__(self, evaluation: Evaluation) -> None:
         """One evaluation."""
         self._watch.look()
-        shown = (
+        rules = (
             ("host_suspended", SUSPENDED_SHOWN_NS, "it was suspended for {:.1f} s"),
             ("wall_clock_set", CLOCK_SET_SHOWN_NS, "its wall clock was set by {:.1f} s"),
         )
-        for code, shown_ns, text in shown:
+        for code, shown_ns, text in rules:
             recent_ns = [
                 step_ns
                 for t_ns, step_ns in self._watch.events[code]

@@ -109,15 +109,15 @@ class LinkCheck:
     def _judge_counts(self, evaluation: Evaluation, grown: Counter[str]) -> None:
         expected = round(self._descriptor.nominal_rate_hz * WINDOW_NS * 1e-9)
         packets = max(expected, grown["packets"] + grown["lost"])
-        for code, counters, words, figure in SHARES:
+        for code, counters, text, figure in SHARES:
             # A late packet is no longer counted as lost once it arrives.
             count = max(0, sum(grown[name] for name in counters))
             share = count / packets
-            evaluation.judge(code, share, words.format(share=share, count=count))
+            evaluation.judge(code, share, text.format(share=share, count=count))
             if figure is not None:
                 evaluation.figures[figure] = share
-        for code, counter, words in EVENTS:
-            evaluation.judge(code, grown[counter], f"{grown[counter]} {words}")
+        for code, counter, text in EVENTS:
+            evaluation.judge(code, grown[counter], f"{grown[counter]} {text}")
         self._judge_connection(evaluation, grown)
         if grown["skipped_bytes"] and not evaluation.figures["damaged_ratio"]:
             message = f"{grown['skipped_bytes']} bytes skipped between packets"
@@ -407,11 +407,11 @@ class SampleQueue:
             self._values = np.zeros((self.capacity, *first.shape), dtype=first.dtype)
         with self._lock:
             for sample in samples:
-                place, t_host_ns = self._num_added % self.capacity, sample.t_host_ns
+                index, t_host_ns = self._num_added % self.capacity, sample.t_host_ns
                 stamps = (t_host_ns, sample.t_device_ns, sample.sequence, now_ns - t_host_ns)
-                self._stamps[place] = stamps
+                self._stamps[index] = stamps
                 if self._values is not None:
-                    self._values[place] = sample.values
+                    self._values[index] = sample.values
                 self._num_added += 1
             num_dropped = max(0, self._num_added - self._num_taken - self.capacity)
             self._num_taken += num_dropped
@@ -420,10 +420,10 @@ class SampleQueue:
     def take(self) -> Block:
         """Everything that waits, oldest first."""
         with self._lock:
-            places = np.arange(self._num_taken, self._num_added) % self.capacity
-            stamps = np.ascontiguousarray(self._stamps[places].T)
+            indices = np.arange(self._num_taken, self._num_added) % self.capacity
+            stamps = np.ascontiguousarray(self._stamps[indices].T)
             values = None
-            if self._values is not None and len(places):
-                values = self._values[places]
+            if self._values is not None and len(indices):
+                values = self._values[indices]
             self._num_taken = self._num_added
         return Block(stamps[0], stamps[1], stamps[2], stamps[3], values)

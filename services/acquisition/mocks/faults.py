@@ -33,6 +33,7 @@ from services.acquisition.drivers.packets import (
     CRC,
     HEADER,
     MAGIC_SIZE,
+    SOURCE_NAMES,
     SOURCES,
     VERSION,
     Packet,
@@ -51,7 +52,6 @@ NUMBERS = {
     b"DXPM": (16, "<f4"),
     b"DXRS": (0, "<f8"),
 }
-SOURCE_NAMES = {number: name for name, number in SOURCES.items()}
 
 Edit = Callable[[bytes], bytes]
 Pinned = Literal["dead", "stuck", "saturated"]
@@ -65,23 +65,12 @@ _numbers = partial(array, "q")
 class DeviceFaults(FrozenModel):
     """What disturbs one device; the default is a perfect one.
 
-    Times in seconds count from the start of the device's first take. `jitter_ms` is the mean of an
-    exponential delay on top of the constant `path_delay_ms`; packets never overtake each other.
-    Noise is per axis. `bit_error_rate` and `byte_loss_rate` act on serial lines only: USB and
-    sockets have checksums of their own.
-
-    What comes during one of `stalls_s` arrives at its end; with `burst_ms` packets arrive together
-    at multiples of it. A reordered packet arrives behind the next one, of a half one the rest never
-    comes. From `wrong_side_from_s` on the other hand's device answers, from `version_from_s` on one
-    of another packet version. The counter starts at `first_sequence` and wraps at 2^32.
-    `dead_taxels` are raw cells that always read zero, stuck ones a constant, saturated ones full
-    scale; the zero of drifted ones is `drift_counts` from where it was at the tare (our glove
-    only). `nan_probability` puts a NaN into a packet of numbers.
-
-    Trackers only, counted from the start of every round: during `occluded_s` a pose tracker says
-    that it is out of range and drifts, a finger tracker does not see the thumb; during
-    `not_running_s` a pose tracker has no tracking at all; during `jumped_s` it says that it runs,
-    but its pose is elsewhere.
+    docs/device_packets.md lists what each of them does. Times in seconds count from the start of
+    the device's first take, those of trackers from the start of every round. `jitter_ms` is the
+    mean of an exponential delay on top of the constant `path_delay_ms`. What comes during one of
+    `stalls_s` arrives at its end; with `burst_ms` packets arrive together at multiples of it.
+    Taxels are raw cells; the zero of drifted ones is `drift_counts` from where it was at the tare
+    (our glove only). Noise is per axis.
     """
 
     skew_ppm: float = Field(default=0.0, ge=-10_000, le=10_000)

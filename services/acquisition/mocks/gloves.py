@@ -11,20 +11,8 @@ from dextouch.schemas import Matrix, matrix_rows
 from dextouch.streams import StreamDescriptor
 from dextouch.tactile.layout import DEXTOUCH_V1, NUM_TAXELS, Side, TactileLayout, split_pads
 from services.acquisition.clock import StationClock
-from services.acquisition.devices import wuji_glove
+from services.acquisition.devices import tactile_glove, wuji_glove
 from services.acquisition.devices.justfloat_glove import TAIL, JustFloatGloveDecoder
-from services.acquisition.devices.tactile_glove import (
-    COMMAND_MAGIC,
-    FULL_SCALE_COUNTS,
-    MAGIC,
-    REQUEST,
-    TIME_SYNC,
-    Command,
-    Status,
-    TactileGlove,
-    encode_identity,
-    encode_reply,
-)
 from services.acquisition.drivers.packets import (
     SOURCES,
     VERSION,
@@ -32,6 +20,7 @@ from services.acquisition.drivers.packets import (
     PacketDecoder,
     encode_packet,
 )
+from services.acquisition.mocks import replay
 from services.acquisition.mocks.faults import (
     DeviceFaults,
     OurPacketEdits,
@@ -39,16 +28,6 @@ from services.acquisition.mocks.faults import (
     PacketFields,
 )
 from services.acquisition.mocks.ports import PtyPort
-from services.acquisition.mocks.replay import (
-    MockDevice,
-    MockPair,
-    MockSlot,
-    PacketSource,
-    ReplayStream,
-    at_rate,
-    device_rng,
-    serial_mock,
-)
 
 FIRMWARE = (1, 0, 0)
 OFFSET_COUNTS = 120.0
@@ -73,12 +52,15 @@ class GloveAnswers:
         self, side: Side, *, serial_number: str, device_time_ns: Callable[[], int]
     ) -> None:
         self._side: Side = side
-        self._identity = encode_identity(serial_number, FIRMWARE)
+        self._identity = tactile_glove.encode_identity(serial_number, FIRMWARE)
         self._device_time_ns = device_time_ns
         # Requests are no sequence: a driver that was started anew counts from 1 again.
-        sizes = (REQUEST.size, REQUEST.size)
+        sizes = (tactile_glove.REQUEST.size, tactile_glove.REQUEST.size)
         self._requests = PacketDecoder(
-            MAGIC, min_payload=0, max_payload=0, others={COMMAND_MAGIC: sizes}
+            tactile_glove.MAGIC,
+            min_payload=0,
+            max_payload=0,
+            others={tactile_glove.COMMAND_MAGIC: sizes},
         )
 
     def answer(self, data: bytes) -> list[bytes]:
@@ -88,13 +70,15 @@ class GloveAnswers:
 
     def _reply(self, packet: Packet, t_received_ns: int) -> bytes:
         bodies = {
-            Command.IDENTIFY: self._identity,
-            Command.TIME_SYNC: TIME_SYNC.pack(t_received_ns),
+            tactile_glove.Command.IDENTIFY: self._identity,
+            tactile_glove.Command.TIME_SYNC: tactile_glove.TIME_SYNC.pack(t_received_ns),
         }
-        body = bodies.get(REQUEST.unpack(packet.payload)[0])
-        status = Status.UNKNOWN_COMMAND if body is None else Status.OK
+        body = bodies.get(tactile_glove.REQUEST.unpack(packet.payload)[0])
+        status = tactile_glove.Status.UNKNOWN_COMMAND if body is None else tactile_glove.Status.OK
         source, t_device_ns = SOURCES[self._side], self._device_time_ns()
-        return encode_reply(packet, status, body or b"", source=source, t_device_ns=t_device_ns)
+        return tactile_glove.encode_reply(
+            packet, status, body or b"", source=source, t_device_ns=t_device_ns
+        )
 
 
 @dataclass(frozen=True)
@@ -108,7 +92,7 @@ class GloveCalibration:
     @staticmethod
     def seeded(side: Side, seed: int, layout: TactileLayout = DEXTOUCH_V1) -> "GloveCalibration":
         """A glove as it comes from the factory: no two cells alike."""
-        rng = device_rng(seed, f"calibration_{side}")
+        rng = replay.device_rng(seed, f"calibration_{side}")
         spread = rng.uniform(-1.0, 1.0, (2, layout.num_raw_cells))
         offset, offset_spread, gain = OFFSET_COUNTS, OFFSET_SPREAD_COUNTS, GAIN_COUNTS_PER_KPA
         if layout != DEXTOUCH_V1:
@@ -148,48 +132,45 @@ class GloveCalibration:
 
 
 def mock_glove(
-    place: MockSlot, *, calibration: GloveCalibration | None = None, worn_side: Side | None = None
-) -> MockPair:
-    """Our own glove, which answers commands.
+    slot: replay.MockSlot,
+    *,
+    calibration: GloveCalibration | None = None,
+    worn_side: Side | None = None,
+) -> replay.MockPair:
+    """Our own glove, which answers commands; its serial number is the name of its slot.
 
-    Args:
-        place: where it stands; its serial number is its name.
-        calibration: of this glove; made from the seed if None.
-        worn_side: which hand it says it is, if it is the wrong one.
+    Without a calibration one is made from the seed; `worn_side` is the hand that it says it is, if
+    that is the wrong one.
     """
-    name, side = place.name, place.side
-    unit_seed = place.seed if place.unit_seed is None else place.unit_seed
-    layout = place.stream.descriptor.layout
+    name, side = slot.name, slot.side
+    unit_seed = slot.seed if slot.unit_seed is None else slot.unit_seed
+    layout = slot.stream.descriptor.layout
     glove = calibration or GloveCalibration.seeded(side, unit_seed, layout or DEXTOUCH_V1)
     worn: Side = worn_side or side
-    source = TactileGloveSource(place.stream, side=worn, calibration=glove, faults=place.faults)
+    source = TactileGloveSource(slot.stream, side=worn, calibration=glove, faults=slot.faults)
     # The device is made of its port, and tells its time to what answers there.
     answers = GloveAnswers(
-        worn, serial_number=name, device_time_ns=lambda: _device_time_ns(device, place.clock)
+        worn, serial_number=name, device_time_ns=lambda: _device_time_ns(device, slot.clock)
     )
     port = PtyPort(name, answer=answers.answer)
-    device = MockDevice(place, source, port)
-    driver = TactileGlove(
-        side, transport=port.transport, clock=place.clock, serial_number=name, layout=layout
+    device = replay.MockDevice(slot, source, port)
+    driver = tactile_glove.TactileGlove(
+        side, transport=port.transport, clock=slot.clock, serial_number=name, layout=layout
     )
-    return MockPair(device, driver, glove.matrices(side))
+    return replay.MockPair(device, driver, glove.matrices(side))
 
 
-class TactileGloveSource(PacketSource):
-    """Packets of one glove.
+class TactileGloveSource(replay.PacketSource):
+    """Packets of one glove, of a stream float32 [n, taxels] in kPa.
 
-    Args:
-        stream: float32 [n, taxels] in kPa.
-        side: which hand.
-        calibration: of this glove.
-        faults: whose dead and drifted raw cells are planted.
+    Dead and drifted raw cells of the faults are planted.
     """
 
-    edits = OurPacketEdits({"stuck": 1_000.0, "saturated": float(FULL_SCALE_COUNTS)})
+    edits = OurPacketEdits({"stuck": 1_000.0, "saturated": float(tactile_glove.FULL_SCALE_COUNTS)})
 
     def __init__(
         self,
-        stream: ReplayStream,
+        stream: replay.ReplayStream,
         *,
         side: Side,
         calibration: GloveCalibration,
@@ -206,17 +187,17 @@ class TactileGloveSource(PacketSource):
         faults = faults or DeviceFaults()
         drifted = list(faults.drifted_taxels)
         moved = self._counts[:, drifted].astype(np.int64) + faults.drift_counts
-        self._counts[:, drifted] = np.clip(moved, 0, FULL_SCALE_COUNTS)
+        self._counts[:, drifted] = np.clip(moved, 0, tactile_glove.FULL_SCALE_COUNTS)
         self._counts[:, list(faults.dead_taxels)] = 0
 
     def units(self, index: int, sequence: int, t_device_ns: int) -> list[bytes]:
         """One packet."""
         counts = self._counts[index]
         packet = Packet(VERSION, SOURCES[self._side], sequence, t_device_ns, counts.tobytes())
-        return [encode_packet(MAGIC, packet)]
+        return [encode_packet(tactile_glove.MAGIC, packet)]
 
 
-def _device_time_ns(device: MockDevice, clock: StationClock) -> int:
+def _device_time_ns(device: replay.MockDevice, clock: StationClock) -> int:
     """Time of a mock device's clock, from its last packet; any origin before the first."""
     ledger, now_ns = device.ledger, clock.now_ns()
     if not ledger.t_device_ns:
@@ -228,21 +209,19 @@ def _device_time_ns(device: MockDevice, clock: StationClock) -> int:
     return ledger.t_device_ns[last] + since_ns + skew_ns
 
 
-def mock_justfloat_glove(place: MockSlot) -> MockPair:
+def mock_justfloat_glove(slot: replay.MockSlot) -> replay.MockPair:
     """A glove that sends bare float32s at the rate of the stream, in the unit of its layout."""
-    source = JustFloatGloveSource(
-        place.stream, side=place.side, dead_taxels=place.faults.dead_taxels
-    )
-    layout = place.stream.descriptor.layout
+    source = JustFloatGloveSource(slot.stream, side=slot.side, dead_taxels=slot.faults.dead_taxels)
+    layout = slot.stream.descriptor.layout
     decoder = JustFloatGloveDecoder(
-        place.side,
+        slot.side,
         num_values=NUM_VALUES if layout is None else layout.num_raw_cells,
         full_scale=FULL_SCALE if layout is None else layout.full_scale,
-        rate_hz=place.stream.descriptor.nominal_rate_hz,
+        rate_hz=slot.stream.descriptor.nominal_rate_hz,
         layout=layout,
     )
-    return serial_mock(
-        place, source=source, decoder=decoder, calibration=_nominal_zero(decoder.descriptors[0])
+    return replay.serial_mock(
+        slot, source=source, decoder=decoder, calibration=_nominal_zero(decoder.descriptors[0])
     )
 
 
@@ -272,21 +251,17 @@ class JustFloatPacketEdits(PacketEdits):
         return data if fields.numbers is None else encode_justfloat(fields.numbers)
 
 
-class JustFloatGloveSource(PacketSource):
+class JustFloatGloveSource(replay.PacketSource):
     """Packets of one glove: the taxels' counts, then zeros in the slots that mean nothing.
 
-    With a layout they are readings in its unit and in the order of its raw cells.
-
-    Args:
-        stream: float32 [n, taxels] in kPa.
-        side: which hand; only needed with a layout.
-        dead_taxels: places in the packet that read zero.
+    With a layout, for which the side is needed, they are readings in its unit and in the order of
+    its raw cells. `stream` is float32 [n, taxels] in kPa; `dead_taxels` of the packet read zero.
     """
 
     edits = JustFloatPacketEdits({"stuck": 1_000.0, "saturated": FULL_SCALE})
 
     def __init__(
-        self, stream: ReplayStream, *, side: Side = "left", dead_taxels: Sequence[int] = ()
+        self, stream: replay.ReplayStream, *, side: Side = "left", dead_taxels: Sequence[int] = ()
     ) -> None:
         self.t_ns, layout = stream.t_ns, stream.descriptor.layout
         if layout is not None:
@@ -310,16 +285,16 @@ def encode_justfloat(values: Float32[np.ndarray, " n"]) -> bytes:
     return values.astype("<f4").tobytes() + TAIL
 
 
-def mock_wuji_glove(place: MockSlot) -> MockPair:
-    """A Wuji glove: wuji_glove.CRC-16, a number of 16 bits, milliseconds."""
+def mock_wuji_glove(slot: replay.MockSlot) -> replay.MockPair:
+    """A Wuji glove: CRC-16, a number of 16 bits, milliseconds."""
     source = WujiGloveSource(
-        at_rate(place.stream, wuji_glove.NOMINAL_RATE_HZ),
-        side=place.side,
-        dead_taxels=place.faults.dead_taxels,
+        replay.at_rate(slot.stream, wuji_glove.NOMINAL_RATE_HZ),
+        side=slot.side,
+        dead_taxels=slot.faults.dead_taxels,
     )
-    decoder = wuji_glove.WujiGloveDecoder(place.side, layout=place.stream.descriptor.layout)
-    return serial_mock(
-        place, source=source, decoder=decoder, calibration=_nominal_zero(decoder.descriptors[0])
+    decoder = wuji_glove.WujiGloveDecoder(slot.side, layout=slot.stream.descriptor.layout)
+    return replay.serial_mock(
+        slot, source=source, decoder=decoder, calibration=_nominal_zero(decoder.descriptors[0])
     )
 
 
@@ -343,19 +318,16 @@ class WujiPacketEdits(PacketEdits):
         return encode_wuji(hand, sequence, time_ms, np.asarray(fields.numbers).tobytes())
 
 
-class WujiGloveSource(PacketSource):
-    """Packets of one glove.
+class WujiGloveSource(replay.PacketSource):
+    """Packets of one glove, of a stream float32 [n, taxels] in kPa.
 
-    Args:
-        stream: float32 [n, taxels] in kPa.
-        side: which hand.
-        dead_taxels: cells of the grid, row by row, that read zero.
+    `dead_taxels` are cells of the grid, row by row, that read zero.
     """
 
     edits = WujiPacketEdits({"stuck": 0.25, "saturated": 1.0})
 
     def __init__(
-        self, stream: ReplayStream, *, side: Side, dead_taxels: Sequence[int] = ()
+        self, stream: replay.ReplayStream, *, side: Side, dead_taxels: Sequence[int] = ()
     ) -> None:
         self.t_ns = stream.t_ns
         self._hand = {name: number for number, name in wuji_glove.HANDS.items()}[side]

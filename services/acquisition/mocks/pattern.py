@@ -69,6 +69,14 @@ PRACTICE_FAULTS: Final = {
     for name, delay_ms in (("head", 0.0), ("wrist_left", 12.0), ("wrist_right", 5.0))
 }
 POSE_RATE_HZ = 100.0
+# Kind, unit and usual rate of streams, by the beginning of their names.
+ROLES: Final[dict[str, tuple[StreamKind, str, float]]] = {
+    "tactile": ("tactile", "kPa", 60.0),
+    "keypoints": ("keypoints", "m", 120.0),
+    "wrist": ("pose", "pose_m_wxyz", POSE_RATE_HZ),
+    "head": ("pose", "pose_m_wxyz", POSE_RATE_HZ),
+    "camera": ("image", "rgb8", 30.0),
+}
 
 
 def pattern_streams(
@@ -76,9 +84,7 @@ def pattern_streams(
 ) -> list[ReplayStream]:
     """All human streams of one round; the end meets the beginning.
 
-    Args:
-        round_s: how long it takes.
-        layout: of the gloves; None for `dextouch_v1`.
+    `layout` is that of the gloves; None for `dextouch_v1`.
     """
     glove = layout or DEXTOUCH_V1
 
@@ -93,18 +99,12 @@ def pattern_streams(
         pressures = _pressures(turns_rad(glove.nominal_rate_hz) + np.pi * index, glove)
         wrist = _poses(poses_rad, np.array([0.4 * index - 0.2, 0.3, 1.0]))
         streams += [
-            _stream(
-                f"tactile_{side}", "tactile", (glove.nominal_rate_hz, "kPa"), pressures, layout
-            ),
-            _stream(
-                f"keypoints_{side}", "keypoints", (120.0, "m"), _keypoints(turns_rad(120.0), side)
-            ),
-            _stream(f"wrist_{side}", "pose", (100.0, "pose_m_wxyz"), wrist),
-            _stream(f"camera_wrist_{side}", "image", (30.0, "rgb8"), images),
+            _stream(f"tactile_{side}", pressures, glove.nominal_rate_hz, layout),
+            _stream(f"keypoints_{side}", _keypoints(turns_rad(120.0), side)),
+            _stream(f"wrist_{side}", wrist),
+            _stream(f"camera_wrist_{side}", images),
         ]
-    streams.append(_stream("head", "pose", (100.0, "pose_m_wxyz"), head))
-    streams.append(_stream("camera_head", "image", (30.0, "rgb8"), images))
-    return streams
+    return [*streams, _stream("head", head), _stream("camera_head", images)]
 
 
 def pattern_calibration() -> dict[str, Matrix]:
@@ -115,12 +115,12 @@ def pattern_calibration() -> dict[str, Matrix]:
 
 def _stream(
     name: str,
-    kind: StreamKind,
-    rate_and_unit: tuple[float, str],
     values: np.ndarray,
+    rate_hz: float | None = None,
     layout: TactileLayout | None = None,
 ) -> ReplayStream:
-    rate_hz, unit = rate_and_unit
+    kind, unit, usual_hz = ROLES[name.partition("_")[0]]
+    rate_hz = rate_hz or usual_hz
     t_ns = np.rint(np.arange(len(values)) * (1e9 / rate_hz)).astype(np.int64)
     descriptor = StreamDescriptor.model_validate(
         {
@@ -199,17 +199,16 @@ def practice_streams(seed: int = 0, *, layout: TactileLayout | None = None) -> l
     The trackers of head and wrists move as one body.
     """
     images = board_images(seed)
-    board = _stream("camera_head", "image", (RATE_HZ, "rgb8"), images)
+    board = _stream("camera_head", images, RATE_HZ)
     # One round for all: a shorter stream would pause until the board is done.
     others = pattern_streams(len(images) / RATE_HZ, layout=layout)
     heads = _practice_heads(seed)
     moved = {"head": heads} | {name: heads @ T for name, T in T_HEAD_WRISTS.items()}
-    poses = [
-        _stream(name, "pose", (POSE_RATE_HZ, "pose_m_wxyz"), pose_from_transform(Ts))
-        for name, Ts in moved.items()
-    ]
-    rest = [_at_rest(s) for s in others if s.descriptor.kind not in {"image", "pose"}]
-    return [*rest, *poses, board]
+    poses = [_stream(name, pose_from_transform(Ts)) for name, Ts in moved.items()]
+    hands = [s for s in others if s.descriptor.kind == "keypoints"]
+    gloves = [s for s in others if s.descriptor.kind == "tactile"]
+    rest = [replace(glove, values=np.zeros_like(glove.values)) for glove in gloves]
+    return [*hands, *rest, *poses, board]
 
 
 def _practice_heads(seed: int) -> Float64[np.ndarray, "n 4 4"]:
@@ -231,12 +230,6 @@ def _practice_heads(seed: int) -> Float64[np.ndarray, "n 4 4"]:
     Ts_camera_board = np.array([board_pose(pose) for pose in boards])
     heads = T_WORLD_BOARD @ invert(T_TRACKER_CAMERA @ Ts_camera_board)
     return heads @ transform(rotation_from_vector(error[:, :3]), error[:, 3:])
-
-
-def _at_rest(stream: ReplayStream) -> ReplayStream:
-    if stream.descriptor.kind != "tactile":
-        return stream
-    return replace(stream, values=np.zeros_like(stream.values))
 
 
 def board_images(seed: int) -> UInt8[np.ndarray, "n h w 3"]:

@@ -324,7 +324,7 @@ class SocketPort(MockPort):
             end.close()
 
     def send(self, unit: bytes) -> bool:
-        """Send all; a host that takes nothing for a second loses it."""
+        """Send all; a host that takes nothing for 20 s loses it."""
         end = self._device_end
         if end is None:
             return False

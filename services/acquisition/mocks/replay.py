@@ -127,13 +127,13 @@ class _Event(NamedTuple):
 class MockDevice:
     """Plays a packet source through a port, disturbed by its faults, keeping a ledger."""
 
-    def __init__(self, place: MockSlot, source: PacketSource, port: MockPort) -> None:
-        faults = place.faults
-        self.name = place.name
+    def __init__(self, slot: MockSlot, source: PacketSource, port: MockPort) -> None:
+        faults = slot.faults
+        self.name = slot.name
         self.source = source
         self.port = port
         self.faults = faults
-        self._rng = device_rng(place.seed, place.name)
+        self._rng = device_rng(slot.seed, slot.name)
         self._boot_ns = boot_time_ns(self._rng)
         self._bit_error_rate = faults.bit_error_rate if port.has_bit_errors else 0.0
         self._byte_loss_rate = faults.byte_loss_rate if port.has_bit_errors else 0.0
@@ -319,16 +319,16 @@ class MockPair:
 
 
 def serial_mock(
-    place: MockSlot,
+    slot: MockSlot,
     *,
     source: PacketSource,
     decoder: Decoder,
     calibration: Mapping[str, Matrix] | None = None,
 ) -> MockPair:
     """A simulated device on a pseudo terminal, read by the real serial transport."""
-    port = PtyPort(place.name)
-    driver = Driver(place.name, transport=port.transport, decoder=decoder, clock=place.clock)
-    return MockPair(MockDevice(place, source, port), driver, calibration or {})
+    port = PtyPort(slot.name)
+    driver = Driver(slot.name, transport=port.transport, decoder=decoder, clock=slot.clock)
+    return MockPair(MockDevice(slot, source, port), driver, calibration or {})
 
 
 def device_rng(seed: int, name: str) -> np.random.Generator:
@@ -358,11 +358,6 @@ def replay_streams(reader: EpisodeReader) -> list[ReplayStream]:
             continue
         data = reader.read(name)
         plain = descriptor.model_copy(update={"unit": "rgb8"})
-        wanted = plain if descriptor.kind == "image" else descriptor
-        streams.append(ReplayStream(wanted, data.t_ref_ns, data.values))
+        played = plain if descriptor.kind == "image" else descriptor
+        streams.append(ReplayStream(played, data.t_ref_ns, data.values))
     return streams
-
-
-def replay_calibration(reader: EpisodeReader) -> dict[str, Matrix]:
-    """What a stored episode knows of its cameras and mounts."""
-    return reader.attributes.matrices()

@@ -9,21 +9,12 @@ import ctypes
 import struct
 import time
 from collections.abc import Sequence
-from types import ModuleType
 from typing import Any
 
 from dextouch.errors import DeviceError, InvalidInputError
-from services.acquisition.clock import StationClock
 from services.acquisition.drivers.packets import SOURCES
 from services.acquisition.drivers.sdk_link import MAX_CHANNELS, BridgeHello
-from services.acquisition.sdk_bridges.source import (
-    OUR_AXES,
-    Reading,
-    Source,
-    hello,
-    import_sdk,
-    station_offset_ns,
-)
+from services.acquisition.sdk_bridges import bridge
 
 INSTALL = "`pip install pylsl`"
 # Chosen: outlets of the same network answer within half a second, and the bridge tries again.
@@ -36,13 +27,10 @@ MAX_SAMPLES = 256
 CORRECTION_PERIOD_S = 1.0
 
 
-class LslStream(Source):
+class LslStream(bridge.Source):
     """One outlet of the Lab Streaming Layer with numeric channels.
 
-    Args:
-        value: what the outlet must have.
-        by: which property has it: `name`, `type` or `source_id`.
-        clock: of this host.
+    Its property `by` (`name`, `type` or `source_id`) has the value.
     """
 
     clock = (
@@ -50,11 +38,9 @@ class LslStream(Source):
         "CLOCK_MONOTONIC and from there to its raw monotonic clock"
     )
 
-    def __init__(self, value: str, *, by: str = "name", clock: StationClock | None = None) -> None:
+    def __init__(self, value: str, *, by: str = "name") -> None:
         super().__init__()
         self._value, self._by = value, by
-        self._clock = clock or StationClock()
-        self._lsl: ModuleType | None = None
         self._inlet: Any = None
         self._correction_s = self._uncertainty_s = self._corrected_s = 0.0
 
@@ -62,11 +48,9 @@ class LslStream(Source):
         """Find the outlet, connect to it, and measure the offset of its clock.
 
         Raises:
-            DeviceError: no such outlet.
-            InvalidInputError: several, or one without numbers.
-            UnavailableError: pylsl is not installed.
+            InvalidInputError: several outlets, or one without numbers.
         """
-        self._lsl = lsl = import_sdk("pylsl", install=INSTALL)
+        lsl = bridge.import_sdk("pylsl", install=INSTALL)
         found = lsl.resolve_byprop(self._by, self._value, minimum=2, timeout=RESOLVE_S)
         if not found:
             raise DeviceError(
@@ -91,31 +75,27 @@ class LslStream(Source):
         self._inlet = lsl.StreamInlet(info, recover=False, max_buflen=1)
         self._guarded(lambda: self._inlet.open_stream(CORRECTION_S))
         self._correct(CORRECTION_S)
-        return hello(
+        return bridge.hello(
             kind="numbers",
             software=f"liblsl {lsl.library_version()}, outlet {info.name()} at {info.hostname()}",
             devices=({"index": 0, "serial_number": self._value, "source": "none"},),
-            frame=OUR_AXES,
+            frame=bridge.OUR_AXES,
             channels=num_channels,
         )
 
-    def read(self) -> Sequence[Reading]:
-        """New samples.
-
-        Raises:
-            DeviceError: the outlet is gone.
-        """
+    def read(self) -> Sequence[bridge.Reading]:
+        """New samples."""
         if time.monotonic() - self._corrected_s > CORRECTION_PERIOD_S:
             self._correct(0.0)
         samples, stamps = self._guarded(
             lambda: self._inlet.pull_chunk(timeout=READ_S, max_samples=MAX_SAMPLES, min_samples=1)
         )
-        offset_ns = station_offset_ns(self._clock)
+        offset_ns = bridge.station_offset_ns(self._clock)
         readings = []
         for values, stamp_s in zip(samples, stamps, strict=True):
             t_ns = round((stamp_s + self._correction_s) * 1e9) + offset_ns
             payload = struct.pack(f"<{len(values)}d", *values)
-            readings.append(Reading(self._value, SOURCES["none"], t_ns, payload))
+            readings.append(bridge.Reading(self._value, SOURCES["none"], t_ns, payload))
         return readings
 
     def close(self) -> None:
@@ -126,7 +106,7 @@ class LslStream(Source):
 
     def present(self) -> list[str]:
         """Name, type, source_id and shape of every outlet of the network."""
-        self._lsl = lsl = import_sdk("pylsl", install=INSTALL)
+        lsl = bridge.import_sdk("pylsl", install=INSTALL)
         return [
             f"{info.name()} (type {info.type()}, source_id {info.source_id()}, "
             f"{info.channel_count()} channels, {info.nominal_srate():g} Hz, {info.hostname()})"
@@ -141,11 +121,7 @@ class LslStream(Source):
         ]
 
     def _guarded(self, call: Any) -> Any:  # noqa: ANN401 - as pylsl's
-        """What a call of pylsl gives.
-
-        Raises:
-            DeviceError: the outlet is lost or does not answer.
-        """
+        """What a call of pylsl gives; DeviceError of an outlet that is lost or does not answer."""
         try:
             return call()
         except RuntimeError as error:  # LostError, TimeoutError and others of pylsl
@@ -156,7 +132,7 @@ class LslStream(Source):
     def _correct(self, timeout_s: float) -> None:
         """Ask liblsl for the present offset; the last one stays where it has no newer one."""
         self._corrected_s = time.monotonic()
-        lib = import_sdk("pylsl.lib", install=INSTALL).lib
+        lib = bridge.import_sdk("pylsl.lib", install=INSTALL).lib
         function = lib.lsl_time_correction_ex
         function.restype = ctypes.c_double
         remote_s, uncertainty_s, code = ctypes.c_double(), ctypes.c_double(), ctypes.c_int32()

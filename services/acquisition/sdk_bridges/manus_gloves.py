@@ -18,19 +18,8 @@ import numpy as np
 from dextouch.errors import DeviceError, InvalidInputError
 from dextouch.hands import NODES, NUM_KEYPOINTS, node_order
 from dextouch.tactile.layout import SIDES, Side
-from services.acquisition.clock import StationClock
 from services.acquisition.drivers.sdk_link import BridgeHello
-from services.acquisition.sdk_bridges.source import (
-    OUR_AXES,
-    Functions,
-    Reading,
-    Source,
-    hand_device,
-    hand_reading,
-    hello,
-    load_library,
-    wrist_axes,
-)
+from services.acquisition.sdk_bridges import bridge
 
 LIBRARY = "libManusSDK_Integrated.so"
 INSTALL = (
@@ -56,76 +45,36 @@ READ_S = 0.02
 REPLACED_NS = 1_000_000_000
 
 
-class Vec3(ctypes.Structure):
-    """`ManusVec3`."""
-
-    _fields_ = (("x", c_float), ("y", c_float), ("z", c_float))
-
-
-class Quaternion(ctypes.Structure):
-    """`ManusQuaternion`: w first."""
-
-    _fields_ = (("w", c_float), ("x", c_float), ("y", c_float), ("z", c_float))
-
-
-class SkeletonNode(ctypes.Structure):
-    """`SkeletonNode` with its `ManusTransform`."""
-
-    _fields_ = (
-        ("id", c_uint32),
-        ("position", Vec3),
-        ("rotation", Quaternion),
-        ("scale", Vec3),
-    )
-
-
-class NodeInfo(ctypes.Structure):
-    """`NodeInfo`."""
-
-    _fields_ = (
-        ("nodeId", c_uint32),
-        ("parentId", c_uint32),
-        ("chainType", c_int),
-        ("side", c_int),
-        ("fingerJointType", c_int),
-    )
-
-
-class RawSkeletonInfo(ctypes.Structure):
-    """`RawSkeletonInfo`."""
-
-    _fields_ = (("gloveId", c_uint32), ("nodesCount", c_uint32), ("publishTime", c_uint64))
-
-
-class SkeletonStreamInfo(ctypes.Structure):
-    """`SkeletonStreamInfo`."""
-
-    _fields_ = (("publishTime", c_uint64), ("skeletonsCount", c_uint32))
-
-
-class CoordinateSystemVUH(ctypes.Structure):
-    """`CoordinateSystemVUH`: view, up, handedness, and metres of the unit."""
-
-    _fields_ = (
-        ("view", c_int),
-        ("up", c_int),
-        ("handedness", c_int),
-        ("unitScale", c_float),
-    )
-
-
-class ManusHost(ctypes.Structure):
-    """`ManusHost`: name and address, and the version, whose size differs between releases.
-
-    It is filled by the SDK and passed back to it, by value on the stack, so the largest form serves
-    for all.
-    """
-
-    _fields_ = (("hostName", c_char * 256), ("ipAddress", c_char * 40), ("version", c_uint32 * 15))
-
-
+Vec3 = bridge.structure("ManusVec3", x=c_float, y=c_float, z=c_float)
+Quaternion = bridge.structure("ManusQuaternion", w=c_float, x=c_float, y=c_float, z=c_float)
+# With its `ManusTransform`.
+SkeletonNode = bridge.structure(
+    "SkeletonNode", id=c_uint32, position=Vec3, rotation=Quaternion, scale=Vec3
+)
+NodeInfo = bridge.structure(
+    "NodeInfo",
+    nodeId=c_uint32,
+    parentId=c_uint32,
+    chainType=c_int,
+    side=c_int,
+    fingerJointType=c_int,
+)
+RawSkeletonInfo = bridge.structure(
+    "RawSkeletonInfo", gloveId=c_uint32, nodesCount=c_uint32, publishTime=c_uint64
+)
+SkeletonStreamInfo = bridge.structure(
+    "SkeletonStreamInfo", publishTime=c_uint64, skeletonsCount=c_uint32
+)
+CoordinateSystemVUH = bridge.structure(
+    "CoordinateSystemVUH", view=c_int, up=c_int, handedness=c_int, unitScale=c_float
+)
+# The size of the version differs between releases. It is filled by the SDK and passed back to it,
+# by value on the stack, so that the largest form serves for all.
+ManusHost = bridge.structure(
+    "ManusHost", hostName=c_char * 256, ipAddress=c_char * 40, version=c_uint32 * 15
+)
 RawSkeletonCallback = ctypes.CFUNCTYPE(None, POINTER(SkeletonStreamInfo))
-FUNCTIONS: Functions = {
+FUNCTIONS: bridge.Functions = {
     "CoreSdk_InitializeIntegrated": (c_int, ()),
     "CoreSdk_ShutDown": (c_int, ()),
     "CoreSdk_InitializeCoordinateSystemWithVUH": (c_int, (CoordinateSystemVUH, c_bool)),
@@ -147,26 +96,22 @@ class _Skeleton:
     t_ns: int
     glove_id: int
     publish_time: int
-    nodes: ctypes.Array[SkeletonNode]
+    nodes: ctypes.Array[ctypes.Structure]
 
 
-def _node_name(node: NodeInfo) -> tuple[str, str]:
+def _node_name(node: ctypes.Structure) -> tuple[str, str]:
     """Chain and joint of a node. The thumb has one joint less, under either of two names."""
     chain, joint = CHAINS[node.chainType], JOINTS[node.fingerJointType]
     return chain, "distal" if (chain, joint) == ("thumb", "intermediate") else joint
 
 
-class ManusGloves(Source):
+class ManusGloves(bridge.Source):
     """Hands of MANUS gloves on this host.
 
     The SDK's callback copies the nodes and returns; all else happens in the thread of the bridge.
     Keypoints are relative to the wrist node and in its axes, which are not ours: calibrate them
-    with `dextouch station calibrate wrist`.
-
-    Args:
-        sides: the hands to serve; of several gloves of one side, the first one that streams.
-        library: name or path of the shared library.
-        clock: of this host.
+    with `dextouch station calibrate wrist`. Of several gloves of one side, the first one that
+    streams is served.
     """
 
     clock = (
@@ -174,17 +119,10 @@ class ManusGloves(Source):
         "only distinguishes new data from repeated data"
     )
 
-    def __init__(
-        self,
-        sides: Sequence[Side] = SIDES,
-        *,
-        library: str = LIBRARY,
-        clock: StationClock | None = None,
-    ) -> None:
+    def __init__(self, sides: Sequence[Side] = SIDES, *, library: str = LIBRARY) -> None:
         super().__init__()
-        self._devices = {side: hand_device(i, side, "manus") for i, side in enumerate(sides)}
+        self._devices = {side: bridge.hand_device(i, side, "manus") for i, side in enumerate(sides)}
         self._path = library
-        self._clock = clock or StationClock()
         self._library: ctypes.CDLL | None = None
         self._skeletons: deque[_Skeleton] = deque(maxlen=QUEUE_READINGS)
         self._has_some = threading.Event()
@@ -196,13 +134,8 @@ class ManusGloves(Source):
         self._published: dict[int, int] = {}
 
     def open(self) -> BridgeHello:
-        """Start the SDK and connect to its integrated core.
-
-        Raises:
-            DeviceError: it does not start.
-            UnavailableError: the library is not there.
-        """
-        self._library = library = load_library(self._path, FUNCTIONS, install=INSTALL)
+        """Start the SDK and connect to its integrated core."""
+        self._library = library = bridge.load_library(self._path, FUNCTIONS, install=INSTALL)
         self._call("CoreSdk_InitializeIntegrated")
         self._call("CoreSdk_RegisterCallbackForRawSkeletonStream", self._callback)
         axes = CoordinateSystemVUH(X_FROM_VIEWER, POSITIVE_Z, RIGHT_HANDED, METRES)
@@ -212,20 +145,16 @@ class ManusGloves(Source):
         library.ManusHost_Init(ctypes.byref(host))
         self._call("CoreSdk_ConnectToHost", host)
         self._call("CoreSdk_SetRawSkeletonHandMotion", NO_HAND_MOTION)
-        return hello(
+        return bridge.hello(
             kind="finger_tracker",
             software=f"MANUS Core SDK, {self._path}",
             devices=tuple(self._devices.values()),
-            frame=OUR_AXES,
+            frame=bridge.OUR_AXES,
             nodes=NODES,
         )
 
-    def read(self) -> Sequence[Reading]:
-        """Hands that the SDK has published since the last call.
-
-        Raises:
-            DeviceError: the SDK has lost its core, or describes no hand.
-        """
+    def read(self) -> Sequence[bridge.Reading]:
+        """Hands that the SDK has published since the last call."""
         if not self._has_some.wait(READ_S):
             connected = c_bool()
             self._call("CoreSdk_GetIsConnectedToCore", ctypes.byref(connected))
@@ -257,7 +186,7 @@ class ManusGloves(Source):
                 "licence and the permission to open it (udev rules of MANUS) there?"
             )
 
-    def _copy(self, stream: "ctypes._Pointer[SkeletonStreamInfo]") -> None:
+    def _copy(self, stream: "ctypes._Pointer[ctypes.Structure]") -> None:
         """The SDK's callback, in a thread of the SDK."""
         t_ns, library = self._clock.now_ns(), self._library
         if library is None:
@@ -276,7 +205,7 @@ class ManusGloves(Source):
                 self._skeletons.append(_Skeleton(t_ns, info.gloveId, info.publishTime, nodes))
         self._has_some.set()
 
-    def _reading(self, skeleton: _Skeleton) -> Reading | None:
+    def _reading(self, skeleton: _Skeleton) -> bridge.Reading | None:
         side, places = self._glove(skeleton)
         owner, owner_ns = self._owners.get(side, (skeleton.glove_id, 0))
         is_other = owner != skeleton.glove_id and skeleton.t_ns - owner_ns < REPLACED_NS
@@ -298,8 +227,8 @@ class ManusGloves(Source):
         if not np.isfinite(q_wxyz).all() or abs(float(np.linalg.norm(q_wxyz)) - 1.0) > 1e-3:
             self.not_sent["no wrist"] += 1
             return None
-        relative = wrist_axes(points, wrist, q_wxyz)
-        return hand_reading(
+        relative = bridge.wrist_axes(points, wrist, q_wxyz)
+        return bridge.hand_reading(
             self._devices[side], skeleton.t_ns, relative, np.isfinite(relative).all(axis=1)
         )
 

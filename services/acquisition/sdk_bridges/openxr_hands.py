@@ -19,22 +19,9 @@ import numpy as np
 from dextouch.errors import DeviceError
 from dextouch.hands import NODES
 from dextouch.tactile.layout import SIDES, Side
-from services.acquisition.clock import StationClock
 from services.acquisition.devices.finger_tracker import NOMINAL_RATE_HZ
 from services.acquisition.drivers.sdk_link import BridgeHello
-from services.acquisition.sdk_bridges.source import (
-    OUR_AXES,
-    Functions,
-    Pace,
-    Reading,
-    Source,
-    hand_device,
-    hand_reading,
-    hello,
-    load_library,
-    station_offset_ns,
-    wrist_axes,
-)
+from services.acquisition.sdk_bridges import bridge
 
 LIBRARY = "libopenxr_loader.so.1"
 INSTALL = "install it (Debian: apt install libopenxr-loader1), or name it with --library"
@@ -59,123 +46,57 @@ STATE_READY, STATE_STOPPING, STATE_LOSS_PENDING, STATE_EXITING = 2, 6, 7, 8
 EVENT_UNAVAILABLE = 4
 API_VERSION_1_0 = 1 << 48
 Handle = c_uint64
-# Begin of every structure that names its type.
-HEADER: Final = (("type", c_int), ("next", ctypes.c_void_p))
 
 
-class ApplicationInfo(ctypes.Structure):
-    """`XrApplicationInfo`."""
-
-    _fields_ = (
-        ("applicationName", c_char * 128),
-        ("applicationVersion", c_uint32),
-        ("engineName", c_char * 128),
-        ("engineVersion", c_uint32),
-        ("apiVersion", c_uint64),
-    )
+def _typed(name: str, **fields: object) -> type[ctypes.Structure]:
+    """A structure that begins with its type, as all that the functions take."""
+    return bridge.structure(name, type=c_int, next=ctypes.c_void_p, **fields)
 
 
-class InstanceCreateInfo(ctypes.Structure):
-    """`XrInstanceCreateInfo`."""
-
-    _fields_ = (
-        *HEADER,
-        ("createFlags", c_uint64),
-        ("applicationInfo", ApplicationInfo),
-        ("enabledApiLayerCount", c_uint32),
-        ("enabledApiLayerNames", POINTER(c_char_p)),
-        ("enabledExtensionCount", c_uint32),
-        ("enabledExtensionNames", POINTER(c_char_p)),
-    )
-
-
-class SystemGetInfo(ctypes.Structure):
-    """`XrSystemGetInfo`."""
-
-    _fields_ = (
-        *HEADER,
-        ("formFactor", c_int),
-    )
-
-
-class SessionCreateInfo(ctypes.Structure):
-    """`XrSessionCreateInfo`; without a graphics binding, as headless sessions are."""
-
-    _fields_ = (*HEADER, ("createFlags", c_uint64), ("systemId", c_uint64))
-
-
-class SessionBeginInfo(ctypes.Structure):
-    """`XrSessionBeginInfo`."""
-
-    _fields_ = (
-        *HEADER,
-        ("primaryViewConfigurationType", c_int),
-    )
-
-
-class Posef(ctypes.Structure):
-    """`XrPosef`: quaternion x y z w, then position."""
-
-    _fields_ = (("orientation", c_float * 4), ("position", c_float * 3))
-
-
-class ReferenceSpaceCreateInfo(ctypes.Structure):
-    """`XrReferenceSpaceCreateInfo`."""
-
-    _fields_ = (*HEADER, ("referenceSpaceType", c_int), ("poseInReferenceSpace", Posef))
-
-
-class EventDataBuffer(ctypes.Structure):
-    """`XrEventDataBuffer`, which holds an event of any kind."""
-
-    _fields_ = (
-        *HEADER,
-        ("varying", ctypes.c_uint8 * 4000),
-    )
-
-
-class SessionStateChanged(ctypes.Structure):
-    """`XrEventDataSessionStateChanged`."""
-
-    _fields_ = (*HEADER, ("session", Handle), ("state", c_int), ("time", c_int64))
-
-
-class HandTrackerCreateInfo(ctypes.Structure):
-    """`XrHandTrackerCreateInfoEXT`."""
-
-    _fields_ = (*HEADER, ("hand", c_int), ("handJointSet", c_int))
-
-
-class HandJointsLocateInfo(ctypes.Structure):
-    """`XrHandJointsLocateInfoEXT`."""
-
-    _fields_ = (*HEADER, ("baseSpace", Handle), ("time", c_int64))
-
-
-class HandJointLocation(ctypes.Structure):
-    """`XrHandJointLocationEXT`."""
-
-    _fields_ = (("locationFlags", c_uint64), ("pose", Posef), ("radius", c_float))
-
-
-class HandJointLocations(ctypes.Structure):
-    """`XrHandJointLocationsEXT`."""
-
-    _fields_ = (
-        *HEADER,
-        ("isActive", c_uint32),
-        ("jointCount", c_uint32),
-        ("jointLocations", POINTER(HandJointLocation)),
-    )
-
-
-class Timespec(ctypes.Structure):
-    """`struct timespec`."""
-
-    _fields_ = (("tv_sec", ctypes.c_long), ("tv_nsec", ctypes.c_long))
-
-
-FUNCTIONS: Functions = {
+ApplicationInfo = bridge.structure(
+    "XrApplicationInfo",
+    applicationName=c_char * 128,
+    applicationVersion=c_uint32,
+    engineName=c_char * 128,
+    engineVersion=c_uint32,
+    apiVersion=c_uint64,
+)
+InstanceCreateInfo = _typed(
+    "XrInstanceCreateInfo",
+    createFlags=c_uint64,
+    applicationInfo=ApplicationInfo,
+    enabledApiLayerCount=c_uint32,
+    enabledApiLayerNames=POINTER(c_char_p),
+    enabledExtensionCount=c_uint32,
+    enabledExtensionNames=POINTER(c_char_p),
+)
+SystemGetInfo = _typed("XrSystemGetInfo", formFactor=c_int)
+# Without a graphics binding, as headless sessions are.
+SessionCreateInfo = _typed("XrSessionCreateInfo", createFlags=c_uint64, systemId=c_uint64)
+SessionBeginInfo = _typed("XrSessionBeginInfo", primaryViewConfigurationType=c_int)
+# Quaternion x y z w, then position.
+Posef = bridge.structure("XrPosef", orientation=c_float * 4, position=c_float * 3)
+ReferenceSpaceCreateInfo = _typed(
+    "XrReferenceSpaceCreateInfo", referenceSpaceType=c_int, poseInReferenceSpace=Posef
+)
+# It holds an event of any kind.
+EventDataBuffer = _typed("XrEventDataBuffer", varying=ctypes.c_uint8 * 4000)
+SessionStateChanged = _typed(
+    "XrEventDataSessionStateChanged", session=Handle, state=c_int, time=c_int64
+)
+HandTrackerCreateInfo = _typed("XrHandTrackerCreateInfoEXT", hand=c_int, handJointSet=c_int)
+HandJointsLocateInfo = _typed("XrHandJointsLocateInfoEXT", baseSpace=Handle, time=c_int64)
+HandJointLocation = bridge.structure(
+    "XrHandJointLocationEXT", locationFlags=c_uint64, pose=Posef, radius=c_float
+)
+HandJointLocations = _typed(
+    "XrHandJointLocationsEXT",
+    isActive=c_uint32,
+    jointCount=c_uint32,
+    jointLocations=POINTER(HandJointLocation),
+)
+Timespec = bridge.structure("timespec", tv_sec=ctypes.c_long, tv_nsec=ctypes.c_long)
+FUNCTIONS: bridge.Functions = {
     "xrCreateInstance": (c_int, (POINTER(InstanceCreateInfo), POINTER(Handle))),
     "xrDestroyInstance": (c_int, (Handle,)),
     "xrGetSystem": (c_int, (Handle, POINTER(SystemGetInfo), POINTER(c_uint64))),
@@ -198,17 +119,12 @@ EXTENSION_FUNCTIONS: dict[str, tuple[Any, ...]] = {
 }
 
 
-class OpenXrHands(Source):
+class OpenXrHands(bridge.Source):
     """Tracked hands of an OpenXR runtime with headless sessions, such as Monado.
 
     Every joint whose position is not both valid and tracked is sent as not seen, and all of them
     where the hand is not active or its wrist is not tracked: a runtime may extrapolate or infer
-    joints that nobody sees.
-
-    Args:
-        sides: the hands to serve.
-        library: name or path of the OpenXR loader.
-        clock: of this host.
+    joints that nobody sees. `library` is name or path of the OpenXR loader.
     """
 
     clock = (
@@ -217,18 +133,13 @@ class OpenXrHands(Source):
         "below 10 µs); the runtime extrapolates to that moment"
     )
 
-    def __init__(
-        self,
-        sides: Sequence[Side] = SIDES,
-        *,
-        library: str = LIBRARY,
-        clock: StationClock | None = None,
-    ) -> None:
+    def __init__(self, sides: Sequence[Side] = SIDES, *, library: str = LIBRARY) -> None:
         super().__init__()
-        self._devices = {side: hand_device(i, side, "openxr") for i, side in enumerate(sides)}
+        self._devices = {
+            side: bridge.hand_device(i, side, "openxr") for i, side in enumerate(sides)
+        }
         self._path = library
-        self._clock = clock or StationClock()
-        self._pace = Pace(NOMINAL_RATE_HZ, self._clock)
+        self._pace = bridge.Pace(NOMINAL_RATE_HZ, self._clock)
         self._library: ctypes.CDLL | None = None
         self._instance, self._session, self._space = Handle(), Handle(), Handle()
         self._trackers: dict[Side, Handle] = {}
@@ -236,13 +147,8 @@ class OpenXrHands(Source):
         self._last: dict[Side, bytes] = {}
 
     def open(self) -> BridgeHello:
-        """Create a headless session with a hand tracker for each side.
-
-        Raises:
-            DeviceError: no runtime, one without these extensions, or without a headset.
-            UnavailableError: the loader is not installed.
-        """
-        self._library = load_library(self._path, FUNCTIONS, install=INSTALL)
+        """Create a headless session with a hand tracker for each side."""
+        self._library = bridge.load_library(self._path, FUNCTIONS, install=INSTALL)
         names = (c_char_p * len(EXTENSIONS))(*EXTENSIONS)
         about = InstanceCreateInfo(TYPE_INSTANCE)
         about.applicationInfo = ApplicationInfo(b"dextouch", 1, b"", 0, API_VERSION_1_0)
@@ -270,20 +176,16 @@ class OpenXrHands(Source):
             self._call(
                 "xrCreateHandTrackerEXT", self._session, byref(hand), byref(self._trackers[side])
             )
-        return hello(
+        return bridge.hello(
             kind="finger_tracker",
             software="OpenXR, XR_EXT_hand_tracking",
             devices=tuple(self._devices.values()),
-            frame=OUR_AXES,
+            frame=bridge.OUR_AXES,
             nodes=NODES,
         )
 
-    def read(self) -> Sequence[Reading]:
-        """The hands of now, 120 times a second.
-
-        Raises:
-            DeviceError: the session is lost.
-        """
+    def read(self) -> Sequence[bridge.Reading]:
+        """The hands of now, 120 times a second."""
         self._pace.wait()
         self._follow_session()
         t_monotonic_ns = self._clock.read_ns(time.CLOCK_MONOTONIC)
@@ -295,7 +197,7 @@ class OpenXrHands(Source):
             byref(Timespec(seconds, nanoseconds)),
             byref(xr_time),
         )
-        t_ns = t_monotonic_ns + station_offset_ns(self._clock)
+        t_ns = t_monotonic_ns + bridge.station_offset_ns(self._clock)
         readings = (self._reading(side, xr_time, t_ns) for side in self._devices)
         return [reading for reading in readings if reading is not None]
 
@@ -321,11 +223,7 @@ class OpenXrHands(Source):
         return result
 
     def _follow_session(self) -> None:
-        """Take in the runtime's events: begin a session that is ready.
-
-        Raises:
-            DeviceError: the runtime ends it.
-        """
+        """Begin a session that is ready; DeviceError of one that the runtime ends."""
         event = EventDataBuffer(TYPE_EVENT)
         while self._call("xrPollEvent", self._instance, byref(event)) != EVENT_UNAVAILABLE:
             if event.type == TYPE_INSTANCE_LOSS:
@@ -339,7 +237,7 @@ class OpenXrHands(Source):
                     raise DeviceError(f"OpenXR: the runtime ends the session (state {state})")
             event = EventDataBuffer(TYPE_EVENT)
 
-    def _reading(self, side: Side, xr_time: c_int64, t_ns: int) -> Reading | None:
+    def _reading(self, side: Side, xr_time: c_int64, t_ns: int) -> bridge.Reading | None:
         joints = (HandJointLocation * NUM_JOINTS)()
         request = HandJointsLocateInfo(TYPE_LOCATE, None, self._space, xr_time)
         found = HandJointLocations(TYPE_LOCATIONS, None, 0, NUM_JOINTS, joints)
@@ -350,16 +248,18 @@ class OpenXrHands(Source):
             return None
         self._last[side] = measured
         flags = np.array([joint.locationFlags for joint in joints], dtype=np.uint64)
-        wanted = np.uint64(POSITION_VALID | POSITION_TRACKED)
-        is_seen = (flags & wanted) == wanted
+        required = np.uint64(POSITION_VALID | POSITION_TRACKED)
+        is_seen = (flags & required) == required
         turned = ORIENTATION_VALID | ORIENTATION_TRACKED
         wrist = joints[WRIST_JOINT]
         has_wrist = is_seen[WRIST_JOINT] and wrist.locationFlags & turned == turned
         if not (found.isActive and has_wrist):
             nowhere = np.full((len(NODES), 3), np.nan)
-            return hand_reading(self._devices[side], t_ns, nowhere, np.zeros(len(NODES), bool))
+            return bridge.hand_reading(
+                self._devices[side], t_ns, nowhere, np.zeros(len(NODES), bool)
+            )
         points = np.array([list(joint.pose.position) for joint in joints])
         x, y, z, w = wrist.pose.orientation
-        relative = wrist_axes(points, points[WRIST_JOINT], np.array([w, x, y, z]))
+        relative = bridge.wrist_axes(points, points[WRIST_JOINT], np.array([w, x, y, z]))
         ours = relative[KEYPOINT_JOINTS] * OUR_SIGNS[side]
-        return hand_reading(self._devices[side], t_ns, ours, is_seen[KEYPOINT_JOINTS])
+        return bridge.hand_reading(self._devices[side], t_ns, ours, is_seen[KEYPOINT_JOINTS])

@@ -1,16 +1,10 @@
 """Weighted estimate of a mount and a target from two series of poses, with its uncertainty.
 
-Every view says T_world_tracker · D · X · B = Z, with the mount X, the target's pose Z, the
-measured pose B of the target in the mounted frame, and a small correction D of the tracker's
-pose, whose size the tracker's noise limits. First the size of each source of noise is estimated
-from the residuals. Then all poses are found together by Gauss–Newton with analytic Jacobians; the
-corrections, six numbers a view, are eliminated by the Schur complement, so that the system to
-solve has 13 unknowns however many views there are. Hand-eye and robot-base calibration are this
-estimate with another sensor in the second series.
-
-The last unknown is the scale of the second series. A board that is s times as large as was entered
-is measured at 1/s of its distance, which would otherwise move the mount without a trace in its
-covariance.
+Every view says T_world_tracker · D · X · B = Z, with the mount X, the target's pose Z, the measured
+pose B of the target in the mounted frame, and a small correction D of the tracker's pose. Sources
+of noise are estimated from the residuals, then all poses by Gauss–Newton. The Schur complement
+eliminates the corrections; the last of 13 unknowns is the scale of the second series: an error of
+the board's size would otherwise move the mount without a trace in its covariance.
 """
 
 from collections.abc import Callable
@@ -22,8 +16,14 @@ from jaxtyping import Float64
 
 from dextouch.errors import InvalidInputError
 from dextouch.geometry import invert, transform
-from services.alignment.calibration.motion import Agreement, adjoint, move, twist, twist_jacobian
-from services.alignment.calibration.places import excess_over_time
+from services.alignment.calibration.motion import (
+    Agreement,
+    adjoint,
+    excess_over_time,
+    move,
+    twist,
+    twist_jacobian,
+)
 
 # Of the Gauss–Newton steps; below the smallest (rad, m) nothing changes that could be measured.
 MAX_ROUNDS = 30
@@ -68,10 +68,8 @@ class TrackerNoise:
 class PoseEstimate:
     """How well views determine a pose.
 
-    Attributes:
-        covariance: [6, 6] of the pose's twist: turn (rad) and shift (m) along its own axes.
-        noise: estimated noise (one sigma per axis), named as in the expected one.
-        left_out_views: views that were far off and did not count.
+    `covariance` is of its twist: turn (rad) and shift (m) along its own axes; `noise` the estimated
+    one (one sigma an axis), named as the expected one; `left_out_views` were too far off to count.
     """
 
     covariance: Float64[np.ndarray, "6 6"]
@@ -114,8 +112,7 @@ class Bundle:
     """The mount X, the target's pose Z in the world, the scale, and how well they are known.
 
     `scale` is true over measured lengths of the second series. The covariance is of the twists of
-    X, then of Z (rad, m, in their own frames), then of the logarithm of the scale; rows and columns
-    of what was given are zero.
+    X, then of Z (rad, m, in their own frames), then of log scale; zero for what was given.
     """
 
     X: Float64[np.ndarray, "4 4"]
@@ -133,13 +130,9 @@ def weighted_bundle(
 ) -> tuple[Bundle, dict[str, float]]:
     """The bundle weighted with the noise estimated from the views, and that noise.
 
-    The second series has the sources of noise `own`, and a scale of one within `scale_sigma` (one
-    sigma; exactly one if 0). Its covariance holds for errors as large as those along changes from
-    place to place, where these are larger than at random.
-
-    Raises:
-        InvalidInputError: mount, target or clock changed along the views, or the steps do not
-            become small.
+    The second series has the noise `own`, and a scale of one within `scale_sigma`. The covariance
+    holds for errors as large as changes from place to place. Raises InvalidInputError: mount,
+    target or clock changed along the views, or the steps do not become small.
     """
     series, Ts = agreed.series, agreed.predicted
     J, C = predicted_jacobians(Ts, agreed.X @ Ts, 1.0)
@@ -171,10 +164,7 @@ def weighted_bundle(
 def sensor_components(
     sensor: str, maps: np.ndarray, sigmas: tuple[float, float]
 ) -> dict[str, Component]:
-    """Rotation and translation noise of a pose sensor, in its own axes; rad and m an axis.
-
-    `maps` [n, 6, 6] take its twists to those of the views.
-    """
+    """Rotation (rad) and translation (m) noise of a sensor's twists; `maps` take them to views'."""
     maps_T = np.swapaxes(maps, 1, 2)
     turns, shifts = maps[:, :, :3] @ maps_T[:, :3], maps[:, :, 3:] @ maps_T[:, 3:]
     return {
@@ -188,15 +178,9 @@ def estimate_sigmas(
 ) -> Float64[np.ndarray, " k"]:
     """Standard deviation of each component (variance component estimation).
 
-    The twist left over in view i has the covariance Σ_k θ_k M_ki of components of known shape. The
-    θ that fit best are found by Fisher scoring of the restricted likelihood (Patterson and Thompson
-    1971: it counts the unknowns that were fitted to the same views), with a log-normal prior about
-    the declared sizes, as few views say little.
-
-    Args:
-        left_over: [n, 6] twists of views that are not explained, before the last linear step.
-        J: [n, 6, m] how they change with the m unknowns that are fitted.
-        components: declared sources of noise.
+    The residual twist of view i [n, 6], which changes with the m fitted unknowns by J [n, 6, m],
+    has the covariance Σ_k θ_k M_ki. Fisher scoring of the restricted likelihood finds the best θ
+    (Patterson and Thompson 1971), with a log-normal prior about the declared sizes.
     """
     M = np.stack([component.shapes for component in components])
     declared = np.log(np.square([component.sigma for component in components]))
@@ -250,16 +234,10 @@ def solve_bundle(
 ) -> Bundle:
     """Estimate mount, target pose and scale from all views together.
 
-    Args:
-        Ts_world_tracker: [n, 4, 4].
-        measurement: of the target's poses in the mounted frame.
-        tracker_sigma: the tracker's noise, rad and m an axis; above zero.
-        start: X and Z within a few degrees and centimetres.
-        is_mount_known: leave X as it is.
-        scale_sigma: expected deviation of the scale from one (one sigma); 0 leaves it at one.
-
-    Raises:
-        InvalidInputError: the steps do not become small.
+    `measurement` is of the target's poses in the mounted frame, the tracker's noise in rad and m an
+    axis; `start` are X (which stays if `is_mount_known`) and Z within a few degrees and
+    centimetres; `scale_sigma` is the expected deviation of the scale from one, 0 leaves it at one.
+    Raises InvalidInputError: the steps do not become small.
     """
     X, Z = start
     free = free_unknowns(is_mount_known=is_mount_known, is_scale_known=scale_sigma == 0)
@@ -308,11 +286,7 @@ def free_unknowns(*, is_mount_known: bool, is_scale_known: bool) -> np.ndarray:
 def predicted_jacobians(
     Ts: np.ndarray, X_B: np.ndarray, scale: float
 ) -> tuple[Float64[np.ndarray, "n 6 13"], Float64[np.ndarray, "n 6 6"]]:
-    """Jacobians of the measured poses by X, Z and the logarithm of the scale, and by D.
-
-    `Ts` are the predicted poses B = X⁻¹ D⁻¹ W⁻¹ Z, measured with translations divided by the scale;
-    `X_B` are X · B.
-    """
+    """Jacobians of predicted poses `Ts` (`X_B` = X · Ts) by X, Z and log scale, and by D."""
     J = np.zeros((len(Ts), 6, 13))
     J[:, :, :6] = -adjoint(invert(Ts))
     J[:, :, 6:12] = np.eye(6)

@@ -1,9 +1,4 @@
-"""Path delays of all streams that were shaken together: trackers, cameras, hands in the world.
-
-What is rigidly connected turns alike: each stream shows the same angular velocity, in axes of its
-own. For every two of them the turn between their axes (Kabsch) and the offset in time are
-estimated; the offsets of all pairs are adjusted together, and must agree around every loop.
-"""
+"""Path delays of all streams that were shaken together: trackers, cameras, hands in the world."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -74,10 +69,9 @@ class PairOffset:
 
 @dataclass(frozen=True)
 class SharedTimes:
-    """Delays of streams after a reference, which has 0.
+    """Delays of streams after a reference, which has 0, and the pairs of streams they come from.
 
-    `pairs` are the measured offsets, `unusable` says why others are not, and `loop_sigmas` is the
-    largest error of a loop of three of them, in standard deviations; 0 without a loop.
+    `unusable` says why pairs are missing; `loop_sigmas` is the largest error of a loop of three.
     """
 
     reference: str
@@ -113,11 +107,9 @@ def turning_of_images(
 ) -> Turning:
     """Angular velocity of a camera from the corners that consecutive images share, in its axes.
 
-    What is far away moves by the rotation alone; what is near or moves by itself is left out as far
-    as most corners agree. Steps without enough corners (blur, a bare wall) have none.
-
-    Raises:
-        DegenerateMotionError: fewer than half of the steps show enough corners.
+    What is near or moves by itself is left out as far as most corners agree; steps without enough
+    corners (blur, a bare wall) have none. Raises DegenerateMotionError: fewer than half have
+    enough.
     """
     times_ns, turns = list[int](), list[np.ndarray]()
     steps_ns = np.diff(t_ns)
@@ -154,8 +146,8 @@ def _turn_between(
     if corners is None or len(corners) < _LEAST_CORNERS:
         return None
     moved, found, _ = cv2.calcOpticalFlowPyrLK(before, after, corners, np.zeros_like(corners))
-    again, back, _ = cv2.calcOpticalFlowPyrLK(after, before, moved, np.zeros_like(corners))
-    off_px = np.linalg.norm((again - corners)[:, 0], axis=1)
+    returned, back, _ = cv2.calcOpticalFlowPyrLK(after, before, moved, np.zeros_like(corners))
+    off_px = np.linalg.norm((returned - corners)[:, 0], axis=1)
     kept = (found[:, 0] > 0) & (back[:, 0] > 0) & (off_px <= _RETURN_PX)
     if np.count_nonzero(kept) < _LEAST_CORNERS:
         return None
@@ -178,14 +170,9 @@ def _turn_between(
 
 
 def pair_offset(a: Turning, b: Turning) -> TimeOffset:
-    """Offset to be added to b's times to align it with a, of streams that turn together.
+    """Offset and turn between the axes of streams that turn together, to be added to b's times.
 
-    Offset and turn between their axes are fitted together (Gauss–Newton): where a hand circles, one
-    makes up for the other, and the offset is known the less.
-
-    Raises:
-        DegenerateMotionError, InvalidInputError: as `estimate_time_offset`, or the offset is not
-            the same throughout.
+    Raises DegenerateMotionError, InvalidInputError: as `estimate_time_offset`, or it changes.
     """
     speeds = [np.linalg.norm(one.velocity_rad_s, axis=1) for one in (a, b)]
     rough = estimate_time_offset(a.t_ns, speeds[0], b.t_ns, speeds[1])
@@ -229,7 +216,6 @@ def pair_offset(a: Turning, b: Turning) -> TimeOffset:
 def _check_constant(
     by_offset: Float64[np.ndarray, "n 3"], left: Float64[np.ndarray, "n 3"], per_number: float
 ) -> None:
-    """Refuse an offset that is another one in some part of the take."""
     energies, offs_s, noise = np.empty((3, _NUM_PARTS))
     parts = (np.array_split(one, _NUM_PARTS) for one in (by_offset, left))
     for part, (moved, rest) in enumerate(zip(*parts, strict=True)):
@@ -251,13 +237,10 @@ def _check_constant(
 def shared_times(turnings: Mapping[str, Turning], reference: str) -> SharedTimes:
     """Delays of streams after the reference, from the offsets of all pairs.
 
-    A delay's standard deviation is that of the best chain of pairs to the reference: more pairs of
-    the same streams share their noise, and make it no smaller. What loops miss zero by is added.
-
-    Raises:
-        DegenerateMotionError: a stream that agrees with no other one, or loops that do not close:
-            one of their streams moved by itself.
-        InvalidInputError: fewer than two streams, or the reference is none of them.
+    A delay's sigma is that of the best chain of pairs to the reference (more pairs of the same
+    streams share their noise), and what loops miss zero by. Raises DegenerateMotionError: a stream
+    that agrees with no other one, or loops that do not close; InvalidInputError: fewer than two
+    streams, or the reference is none of them.
     """
     if len(turnings) < 2 or reference not in turnings:
         raise InvalidInputError(
@@ -272,14 +255,14 @@ def shared_times(turnings: Mapping[str, Turning], reference: str) -> SharedTimes
             unusable[a, b] = error.message
     names = list(turnings)
     sigmas_ns = _chain_sigmas_ns(names, pairs, reference)
-    lone = [name for name in names if not np.isfinite(sigmas_ns[name])]
-    if lone:
-        reasons = [text for pair, text in unusable.items() if lone[0] in pair]
+    isolated = [name for name in names if not np.isfinite(sigmas_ns[name])]
+    if isolated:
+        reasons = [text for pair, text in unusable.items() if isolated[0] in pair]
         raise DegenerateMotionError(
-            f"times: {', '.join(lone)} turned like no stream that leads to {reference!r} "
+            f"times: {', '.join(isolated)} turned like no stream that leads to {reference!r} "
             f"({reasons[0]}); hold everything together rigidly and shake it briskly about all axes "
             "for ten seconds, or leave the stream out with --streams",
-            streams=lone,
+            streams=isolated,
         )
     loop_sigmas = _check_loops(names, pairs)
     delays_ns, misses_ns = _adjusted_ns(names, pairs, reference)
@@ -313,7 +296,6 @@ def _adjusted_ns(
 def _chain_sigmas_ns(
     names: Sequence[str], pairs: Sequence[PairOffset], reference: str
 ) -> dict[str, float]:
-    """Standard deviation of each delay by the chain of pairs with the smallest one."""
     steps = np.zeros((len(names), len(names)))
     for pair in pairs:
         steps[names.index(pair.a), names.index(pair.b)] = float(pair.offset.sigma_ns) ** 2
@@ -322,11 +304,7 @@ def _chain_sigmas_ns(
 
 
 def _check_loops(names: Sequence[str], pairs: Sequence[PairOffset]) -> float:
-    """The largest error of a loop of three offsets in standard deviations.
-
-    Raises:
-        DegenerateMotionError: it is too large; names the stream that the wrong loops share.
-    """
+    """The largest error of a loop of three offsets in standard deviations, unless too large."""
     of = {(pair.a, pair.b): pair.offset for pair in pairs}
     worst, wrong, wrong_ms = 0.0, list[tuple[str, str, str]](), 0.0
     for loop in combinations(names, 3):

@@ -1,22 +1,19 @@
 """Where a camera sits on its tracker, and a robot's base in the tracked world, with sigmas.
 
-A closed form provides the initial values, and degenerate motion is refused. Then the noise of
-tracker and camera is estimated from the residuals, and a bundle adjustment weighted with it
-estimates mount, board and the tracker error of every view. Its covariance is that of the result.
-
-A tracker on a robot's end effector says T_world_tracker = T_world_base · T_base_effector ·
-T_effector_tracker in every pose. Where the tracker sits on the effector is found too, unless it
-is given; both as in hand-eye calibration, with the base in the place of the board.
+A robot says T_world_tracker = T_world_base · T_base_effector · T_effector_tracker.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from jaxtyping import Float64
 
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
+from dextouch.frozen_model import FrozenModel
 from dextouch.geometry import Distortion, invert
+from dextouch.geometry.rotations import vector_from_rotation
 from services.alignment.calibration.bundle import (
     Bundle,
     Component,
@@ -30,17 +27,21 @@ from services.alignment.calibration.bundle import (
 from services.alignment.calibration.motion import (
     AXIS_NAMES,
     MIN_VIEWS,
+    WANTED_ROTATION_RAD,
+    WANTED_TRANSLATION_M,
     DegenerateMotionError,
     Series,
     adjoint,
     agreeing_views,
     checked_poses,
+    mean_series,
     missing_axes,
     move,
+    place_labels,
     view_errors,
+    view_pairs,
     wrong_scale,
 )
-from services.alignment.calibration.places import mean_series, place_labels
 
 TASK = "hand-eye"
 BASE_TASK = "robot base"
@@ -56,16 +57,28 @@ NUM_SCALE_SIGMAS = 3.0
 MIN_SCALE_INFORMATION = 1e-3
 # Poses of a board come from a solver; few steps bring them to the minimum of the pixels.
 POLISH_ROUNDS = 5
+# A slip is recognised with three places on either side of it; the rest is chosen.
+WANTED_PLACES: Final = 12
+# Turns spread uniformly over 20 degrees to either side give 16; the solver refuses less than 10.
+WANTED_SPREAD_RAD: Final = float(np.deg2rad(12.0))
+# Chosen: with less the size of the board is hardly known from the views.
+WANTED_DISTANCE_RATIO: Final = 1.4
+# Keeps the spread of turns about one axis only finite; less than any turn that is meant.
+SMALLEST_SPREAD_RAD: Final = float(np.deg2rad(0.5))
+# Title and advice of turns about the camera's x (right), y (down) and z (viewing direction).
+TURNS: Final = (
+    ("Tilt up and down", "tilt the camera up and down"),
+    ("Turn left and right", "turn the camera left and right, about its vertical axis"),
+    ("Roll", "roll the camera about its viewing direction, as an ear goes to the shoulder"),
+)
 
 
 @dataclass(frozen=True)
 class HandEyeNoise(TrackerNoise):
-    """Expected noise, one sigma for each axis; refined from the views.
+    """Expected noise of a Vive tracker and a sharp board, one sigma an axis, before refinement.
 
-    That of the tracker and the pixels holds for a Vive tracker and a sharp board. `board_*` are of
-    a board's pose that a solver found, in the camera's axes; they count only where no corners are
-    given. `board_scale` is how well the size of the print is known, as a share: by a
-    ruler a millimetre of 20 cm.
+    `board_*` are of a board's pose by a solver, in the camera's axes, where no corners are given;
+    `board_scale` is how well the size of the print is known: by a ruler a millimetre of 20 cm.
     """
 
     pixel_px: float = 0.3
@@ -78,11 +91,7 @@ class HandEyeNoise(TrackerNoise):
 
 @dataclass(frozen=True)
 class HandEyeResult(PoseEstimate):
-    """Where the camera sits on the tracker, and how well that is known.
-
-    `board_scale` is the size of the board by the tracker's metres over the size that was entered,
-    estimated with the mount, so that its uncertainty is part of the mount's.
-    """
+    """The mount of a camera, and how well it is known; `board_scale` is true over entered size."""
 
     T_tracker_camera: Float64[np.ndarray, "4 4"]
     board_scale: float
@@ -93,8 +102,7 @@ class HandEyeResult(PoseEstimate):
 class BoardViews:
     """Detected corners of a board in several views, and the camera's K and distortion.
 
-    `points_board` are [k ≥ 4, 3] corners of each view in board coordinates (m), `pixels_px` [k, 2]
-    where they were seen; the distortion is k1 k2 p1 p2 k3.
+    `points_board` are [k ≥ 4, 3] corners of each view (m), `pixels_px` [k, 2] where they were seen.
     """
 
     points_board: Sequence[np.ndarray]
@@ -164,12 +172,8 @@ def solve_hand_eye(
 ) -> HandEyeResult:
     """Estimate the mount of a camera on a tracker from views of a fixed board.
 
-    Args:
-        Ts_world_tracker: [n ≥ 4, 4, 4] poses of the tracker in the world.
-        Ts_camera_board: [n, 4, 4] poses of the board in the camera, same moments.
-        views: the corners from which the board's poses were computed; with them each view is
-            weighted by the information in its pixels, which is more accurate.
-        noise: expected noise; default `HandEyeNoise()`.
+    Both series are poses [n ≥ 4, 4, 4] of the same moments. With the corners (`views`) from which
+    the board's poses were computed, each view is weighted by the information in its pixels.
 
     Raises:
         DegenerateMotionError: the tracker was rotated too little, or about one axis only, or the
@@ -192,7 +196,7 @@ def solve_hand_eye(
     agreed = agreeing_views(series)
     if views is None:
         placed = agreed._replace(series=mean_series(agreed.series, place_labels(agreed.series)))
-        own = board_components(placed.predicted, noise)
+        own_noise = board_components(placed.predicted, noise)
     else:
         one_pixel = views.only(agreed.views).measurement(1.0)
         polished = polish(one_pixel, agreed.series.Ts_mounted_target)
@@ -201,8 +205,8 @@ def solve_hand_eye(
         placed = agreed._replace(series=mean_series(agreed.series, labels))
         information = np.zeros((labels.max() + 1, 6, 6))
         np.add.at(information, labels, one_pixel(polished).information)
-        own = {"pixel_px": Component(noise.pixel_px, np.linalg.inv(information))}
-    bundle, sigmas = weighted_bundle(placed, noise, own, scale_sigma=noise.board_scale)
+        own_noise = {"pixel_px": Component(noise.pixel_px, np.linalg.inv(information))}
+    bundle, sigmas = weighted_bundle(placed, noise, own_noise, scale_sigma=noise.board_scale)
     _check_scale(bundle, noise.board_scale, names)
     result = HandEyeResult(
         covariance=bundle.covariance[:6, :6],
@@ -263,11 +267,7 @@ def board_components(Ts_camera_board: np.ndarray, noise: HandEyeNoise) -> dict[s
 def project(
     points_board: np.ndarray, Ts_camera_board: np.ndarray, K: np.ndarray, distortion: np.ndarray
 ) -> tuple[Float64[np.ndarray, "n k 2"], Float64[np.ndarray, "n k 2 6"]]:
-    """Project corners [n, k, 3], with the Jacobian by twists of the board's poses.
-
-    Raises:
-        InvalidInputError: a corner lies behind the camera.
-    """
+    """Project corners [n, k, 3] before the camera, with Jacobians by twists of the board."""
     import cv2
 
     points = points_board @ np.swapaxes(Ts_camera_board[:, :3, :3], 1, 2)
@@ -296,11 +296,7 @@ def polish(measurement: Measurement, Ts_camera_board: np.ndarray) -> Float64[np.
 
 @dataclass(frozen=True)
 class RobotBaseResult(PoseEstimate):
-    """Pose of the robot's base in the tracked world, and how well it is known.
-
-    `T_effector_tracker`, where the tracker sits, is as given, or found. The two RMS are how far the
-    pairs turn and put the base from there.
-    """
+    """Pose of the robot's base, how well it is known, and how far pairs are off (RMS)."""
 
     T_world_base: Float64[np.ndarray, "4 4"]
     T_effector_tracker: Float64[np.ndarray, "4 4"]
@@ -314,22 +310,17 @@ def solve_robot_base(
     *,
     T_effector_tracker: np.ndarray | None = None,
 ) -> RobotBaseResult:
-    """Estimate the robot's base in the tracked world from simultaneous pairs of poses.
+    """Estimate the robot's base in the tracked world, and the noise, from simultaneous poses.
 
-    The noise of tracker and robot is estimated from the pairs too.
-
-    Args:
-        Ts_world_tracker: [n ≥ 4, 4, 4] poses of a tracker that the effector carries.
-        Ts_base_effector: [n, 4, 4] poses of the effector, from the robot's own joints.
-        T_effector_tracker: where the tracker sits; the identity where both series are of the same
-            frame; None to find it.
+    Both series are [n ≥ 4, 4, 4], of a tracker that the effector carries, and of the effector by
+    the robot's own joints. `T_effector_tracker` is the identity where both are of the same frame,
+    None to find it.
 
     Raises:
-        DegenerateMotionError: the effector was turned too little or about one axis only (or,
-            where the tracker's place is given, hardly moved), or the base stays less known than
-            half a degree and 10 mm.
-        InvalidInputError: too few pairs, or pairs that contradict each other (an inverted series
-            is named).
+        DegenerateMotionError: the effector was turned too little or about one axis only (or, of a
+            known tracker, hardly moved), or the base stays less known than half a degree and 10 mm.
+        InvalidInputError: too few pairs, or pairs that contradict each other (an inverted series is
+            named).
         ShapeError, NonFiniteError: no [n, 4, 4], or NaN.
     """
     tracker, effector = checked_poses(
@@ -386,3 +377,152 @@ def _check_places(Ts_base_effector: np.ndarray) -> None:
         spread_m=[float(value) for value in spread_m],
         missing_axes=names,
     )
+
+
+class GaugeView(FrozenModel):
+    """A figure of a mount's run, what it has to reach, and the share of the way (0 to 1)."""
+
+    title: str
+    value: str
+    wanted: str
+    share: float
+
+
+@dataclass(frozen=True)
+class MountProgress:
+    """What the places so far say of a mount.
+
+    Views of one place (within 2 degrees and 10 mm) count once. `todo` is advice, most important
+    first, empty if there is enough; `result` the mount, None while it is not determined; `problem`
+    why the solver refuses the places.
+    """
+
+    num_places: int
+    gauges: tuple[GaugeView, ...]
+    todo: tuple[str, ...]
+    result: HandEyeResult | None = None
+    problem: str = ""
+
+    @property
+    def is_enough(self) -> bool:
+        """Whether the mount is as well known as it has to be."""
+        return not self.todo
+
+    @property
+    def share(self) -> float:
+        """Share of the way, that of the gauge that is least far."""
+        return min(gauge.share for gauge in self.gauges)
+
+
+def mount_progress(
+    Ts_world_tracker: np.ndarray,
+    Ts_camera_board: np.ndarray,
+    *,
+    views: BoardViews | None = None,
+) -> MountProgress:
+    """Solve as `solve_hand_eye`, once there are enough views, and say what is missing."""
+    num_places = len(Ts_world_tracker)
+    if num_places >= MIN_VIEWS:
+        names = ("Ts_world_tracker", "Ts_camera_board")
+        series = Series(TASK, "tracker", Ts_world_tracker, Ts_camera_board, names)
+        num_places = int(place_labels(series, min_places=1).max()) + 1
+    spreads_rad, wanted = turn_spreads(Ts_camera_board), f"{np.rad2deg(WANTED_SPREAD_RAD):.0f}°"
+    motion = [
+        _gauge(title, f"{np.rad2deg(spread):.0f}°", wanted, spread / WANTED_SPREAD_RAD)
+        for (title, _), spread in zip(TURNS, spreads_rad, strict=True)
+    ]
+    distances_m = np.linalg.norm(np.reshape(Ts_camera_board, (-1, 4, 4))[:, :3, 3], axis=1)
+    motion.append(_distance_gauge(distances_m))
+    places = _gauge("Places", str(num_places), str(WANTED_PLACES), num_places / WANTED_PLACES)
+    result, problem = None, ""
+    if num_places >= MIN_VIEWS:
+        try:
+            result = solve_hand_eye(Ts_world_tracker, Ts_camera_board, views=views)
+        except DegenerateMotionError:
+            # The gauges say which motion is missing.
+            pass
+        except InvalidInputError as error:
+            problem = error.message
+    accuracy = _accuracy_gauges(result)
+    todo = _todo(num_places, spreads_rad, motion[-1], result, problem)
+    return MountProgress(num_places, (places, *motion, *accuracy), tuple(todo), result, problem)
+
+
+def camera_turns(Ts_camera_board: np.ndarray) -> Float64[np.ndarray, "pairs 3"]:
+    """Turns of the camera about its own axes between all pairs of views, rotation vectors (rad)."""
+    pairs = view_pairs(len(Ts_camera_board))
+    R = Ts_camera_board[:, :3, :3]
+    return vector_from_rotation(R[pairs[:, 1]] @ np.swapaxes(R[pairs[:, 0]], 1, 2))
+
+
+def turn_spreads(Ts_camera_board: np.ndarray) -> Float64[np.ndarray, "3"]:
+    """RMS of the camera's turns about each axis alone (rad): 1 / sqrt((C⁻¹)_ii) of covariance C."""
+    if len(Ts_camera_board) < 2:
+        return np.zeros(3)
+    turns_rad = camera_turns(Ts_camera_board)
+    covariance = turns_rad.T @ turns_rad / len(turns_rad)
+    inverse = np.linalg.inv(covariance + SMALLEST_SPREAD_RAD**2 * np.eye(3))
+    return 1 / np.sqrt(np.diag(inverse))
+
+
+def _gauge(title: str, value: str, wanted: str, share: float) -> GaugeView:
+    return GaugeView(title=title, value=value, wanted=wanted, share=min(1.0, float(share)))
+
+
+def _distance_gauge(distances_m: np.ndarray) -> GaugeView:
+    value, share = "unknown", 0.0
+    if len(distances_m):
+        ratio = float(distances_m.max()) / float(distances_m.min())
+        value, share = f"{ratio:.1f} to 1", np.log(ratio) / np.log(WANTED_DISTANCE_RATIO)
+    return _gauge("Farthest to nearest", value, f"{WANTED_DISTANCE_RATIO:g} to 1", share)
+
+
+def _accuracy_gauges(result: HandEyeResult | None) -> tuple[GaugeView, GaugeView]:
+    turn, shift, turn_share, shift_share = "unknown", "unknown", 0.0, 0.0
+    if result is not None:
+        rad, m = result.sigma_rotation_rad, result.sigma_translation_m
+        turn, turn_share = f"± {np.rad2deg(rad):.2f}°", WANTED_ROTATION_RAD / rad
+        shift, shift_share = f"± {m * 1e3:.1f} mm", WANTED_TRANSLATION_M / m
+    return (
+        _gauge("Direction", turn, f"± {np.rad2deg(WANTED_ROTATION_RAD):.2f}°", turn_share),
+        _gauge("Position", shift, f"± {WANTED_TRANSLATION_M * 1e3:.1f} mm", shift_share),
+    )
+
+
+def _todo(
+    num_places: int,
+    spreads_rad: np.ndarray,
+    distance: GaugeView,
+    result: HandEyeResult | None,
+    problem: str,
+) -> list[str]:
+    if problem:
+        return [problem]
+    if num_places < 2:
+        return ["show the whole board to the camera and hold still"]
+    todo = [
+        f"{TURNS[axis][1]}, by 20 degrees to either side"
+        for axis in np.argsort(spreads_rad)
+        if spreads_rad[axis] < WANTED_SPREAD_RAD
+    ]
+    if distance.share < 1:
+        todo.append(
+            f"hold the camera nearer to the board and farther off (so far {distance.value})"
+        )
+    if num_places < WANTED_PLACES:
+        todo.append(f"{_more(WANTED_PLACES - num_places)}, each turned another way")
+    if result is None:
+        return todo or ["turn the camera farther to all sides"]
+    excess = max(
+        result.sigma_rotation_rad / WANTED_ROTATION_RAD,
+        result.sigma_translation_m / WANTED_TRANSLATION_M,
+    )
+    if excess > 1:
+        # A sigma falls with the square root of the number of places.
+        missing = max(1, int(np.ceil(num_places * (excess**2 - 1))))
+        todo.append(f"about {_more(missing)}, turned farther and nearer to the board than so far")
+    return todo
+
+
+def _more(number: int) -> str:
+    return f"{number} more place{'s' if number > 1 else ''}"

@@ -1,9 +1,4 @@
-"""Camera intrinsics from photos of a flat board: detected corners, blur, and calibration.
-
-A photo taken while camera or board moves shifts all corners along the motion, by half a pixel at 6
-px of blur, which the residuals do not show because the board's pose absorbs it. The edges of the
-squares do show it, those across the motion more than those along it.
-"""
+"""Camera intrinsics from photos of a flat board: detected corners, blur, and calibration."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -89,9 +84,9 @@ class CharucoBoard:
 class FoundBoards:
     """Corners of one board on photos of one size (width, height).
 
-    `points_board` are [k, 3] corners of each photo in board coordinates (m), `pixels_px` [k, 2]
-    where they are, `photos` the indices of those of `num_photos` on which the board was found;
-    `pattern` says how it is printed.
+    `points_board` are [k, 3] corners of each photo on the board (m), `pixels_px` [k, 2] where they
+    are, `photos` the indices of those of `num_photos` that show the board, `pattern` says how it is
+    printed.
     """
 
     points_board: tuple[Float32[np.ndarray, "_ 3"], ...]
@@ -107,12 +102,9 @@ class CameraCalibration:
     """A pinhole camera (K in px) with distortion k1 k2 p1 p2 k3, and standard deviations.
 
     Attributes:
-        sigma_fxfycxcy_px: standard deviations of fx fy cx cy; they show how good the calibration
-            is. `rms_px` does not: it is as small for 8 views as for 40. Photos of one place count
-            once, and errors that follow the place in the image or time count as they are.
-        rms_px: of the residuals between corners and model, both axes together.
-        rms_by_place_px: the same by place of the board; a much larger one means that its photo is
-            blurred.
+        sigma_fxfycxcy_px: standard deviations of fx fy cx cy: how good the calibration is.
+        rms_px: of the residuals, both axes together; as small for 8 views as for 40.
+        rms_by_place_px: the same by place of the board; a much larger one is of a blurred photo.
         board_bend_m: height of the board's bend, which is estimated where the corners show it.
         coverage: share of a 4 × 4 grid over the image in which corners were seen.
         used_images: indices of the photos on which the board was found and fits the others.
@@ -139,17 +131,10 @@ Detector = Callable[[np.ndarray], View | None]
 
 
 def find_boards(images: Sequence[np.ndarray], board: Chessboard | CharucoBoard) -> FoundBoards:
-    """Detect a board in every photo; photos without it are skipped.
+    """Detect a board in photos (uint8 [h, w] or [h, w, 3], all of one size); others are skipped.
 
-    Both ways in which ChArUco boards are printed are tried, and the one that fits is named.
-
-    Args:
-        images: uint8 [h, w] or [h, w, 3], all of one size.
-        board: what is on the photos.
-
-    Raises:
-        ShapeError: no images, or of different sizes.
-        InvalidInputError: the board is no board.
+    Both ways in which ChArUco boards are printed are tried, and the one that fits is named. Raises
+    ShapeError: no images, or of different sizes; InvalidInputError: the board is no board.
     """
     photos = [_grey(image, index) for index, image in enumerate(images)]
     if len({photo.shape for photo in photos}) != 1:
@@ -177,16 +162,10 @@ def find_boards(images: Sequence[np.ndarray], board: Chessboard | CharucoBoard) 
 def calibrate_camera(
     images: Sequence[np.ndarray], board: Chessboard | CharucoBoard
 ) -> CameraCalibration:
-    """Intrinsics from photos of one board in different tilts and places.
+    """Intrinsics from photos, uint8 [h, w] or [h, w, 3], of one board in different tilts.
 
-    Args:
-        images: uint8 [h, w] or [h, w, 3], all of one size; photos without the board are left out.
-        board: what is on the photos.
-
-    Raises:
-        ShapeError: no images, or of different sizes.
-        InvalidInputError: the board is found in too few photos, or is no board.
-        DegenerateMotionError: the views do not show the focal length; tilt the board.
+    Photos without the board are left out. Raises ShapeError: no images, or of different sizes;
+    others as `calibrate_found`.
     """
     return calibrate_found(find_boards(images, board))
 
@@ -194,12 +173,10 @@ def calibrate_camera(
 def calibrate_found(found: FoundBoards) -> CameraCalibration:
     """`calibrate_camera` for corners that were detected before.
 
-    Photos of one place count once. Places that do not fit the others are left out, at most a fifth.
-
-    Raises:
-        InvalidInputError: the board is found in too few photos.
-        DegenerateMotionError: the views do not show the focal length; tilt the board.
-        LensModelError: the lens is none of the model's, such as a fisheye, or it changed.
+    Photos of one place count once; places that do not fit the others are left out, at most a fifth.
+    Raises InvalidInputError: the board is found in too few photos; DegenerateMotionError: the views
+    do not show the focal length; LensModelError: another kind of lens, such as a fisheye, or it
+    changed.
     """
     if len(found.photos) < MIN_VIEWS:
         raise InvalidInputError(
@@ -287,7 +264,6 @@ def _fitted(places: list[_Place], size_px: tuple[int, int]) -> "LensFit":
 
 
 def _check_lens(fit: "LensFit", places: list[_Place], size_px: tuple[int, int]) -> None:
-    """Refuse lenses that the model does not describe, and those that changed."""
     from services.alignment.calibration.lens_fit import fisheye_rms_px
 
     image = fit.image.p_value < MAX_CHANCE and fit.image_share > MIN_MISFIT_SHARE
@@ -342,17 +318,10 @@ def max_edge_width_px(photo: np.ndarray) -> float:
 def edge_width_px(
     photo: UInt8[np.ndarray, "h w"], points_board: np.ndarray, pixels: np.ndarray
 ) -> float:
-    """Width over which the edges between dark and light squares rise.
+    """Width over which edges of squares rise: 2.5 sigma of the blur; infinity without neighbours.
 
-    The edges along each of the board's two axes are summarized by their median; the wider counts.
-
-    Args:
-        photo: grey.
-        points_board: [n, 3] corners in board coordinates (m), of a regular grid.
-        pixels: [n, 2] where they were seen; the middle of the first pixel is 0, 0.
-
-    Returns:
-        About 2.5 sigma of the blur; infinity where no two corners are neighbours.
+    Corners [n, 3] of a regular grid (m) are seen at [n, 2] pixels (middle of the first pixel 0, 0);
+    the wider of the medians along the board's two axes counts.
     """
     grid = np.asarray(points_board, dtype=np.float64)[:, :2]
     separation_m = grid[None] - grid[:, None]

@@ -1,9 +1,8 @@
 """Pinhole camera with distortion fitted to corners of a board that may be slightly bent.
 
-The residuals tell whether the model holds. Of a bent board they follow the place on the board; the
-bend is then estimated as well (Strobl and Hirzinger 2011 estimate the whole board). Of a lens that
-is none of the model's they follow the place in the image, and of a lens that was focused or zoomed
-meanwhile the order of the photos.
+Residuals of a bent board follow the place on it, and the bend is estimated, too (as Strobl and
+Hirzinger 2011); of another lens model the place in the image, of a changed lens the order of
+photos.
 """
 
 from collections.abc import Sequence
@@ -17,7 +16,7 @@ from numpy.polynomial import chebyshev
 from dextouch.errors import InvalidInputError
 from dextouch.geometry import NUM_DISTORTION, Distortion
 from dextouch.geometry.rotations import rotation_from_vector
-from services.alignment.calibration.places import Structure, structure
+from services.alignment.calibration.motion import Structure, structure
 
 # Radial functions show an equidistant lens, of which k1 k2 k3 leave waves along the radius.
 # fx fy cx cy and the distortion.
@@ -41,12 +40,10 @@ class LensFit(NamedTuple):
     """Least squares, and what its residuals show.
 
     Attributes:
-        covariance: of fx fy cx cy k1 k2 p1 p2 k3. It holds for errors as large as those along
-            smooth functions of image, board and time, where these are larger than between
-            neighbouring corners.
-        board_bend_m: how much the board is bent: largest distance of a corner from a plane.
-        image: structure over the image.
-        drift: structure over time: the order of the photos.
+        covariance: of fx fy cx cy k1 k2 p1 p2 k3, for errors as large as those along smooth
+            functions of image, board and time, if larger than between neighbouring corners.
+        board_bend_m: largest distance of a corner from a plane.
+        image: structure over the image; `drift`: over the order of the photos.
         misfit_px: RMS of the residuals that `image` explains, both axes together.
         image_share: of the squares of all residuals that it explains.
         focal_drift: change of the focal length from the first photo to the last, as a share of it.
@@ -89,10 +86,8 @@ def fit_lens(
 ) -> LensFit:
     """Fit a camera to corners [k, 3] (m) of a flat board and where photos show them [k, 2] (px).
 
-    The points are one board's, in the same coordinates in all photos.
-
-    Raises:
-        InvalidInputError: no camera shows the corners so.
+    The points are one board's, in the same coordinates in all photos. Raises InvalidInputError: no
+    camera shows the corners so.
     """
     points = [np.asarray(one, dtype=np.float64) for one in points_board]
     pixels = [np.asarray(one, dtype=np.float64) for one in pixels]
@@ -123,7 +118,6 @@ def fit_lens(
 def _with_statistics(
     camera: _Camera, design: _Design, heights_m: np.ndarray, num_corners: list[int]
 ) -> LensFit:
-    """The fit with its covariance and the structure of its residuals."""
     residuals, num_others = design.residuals, 6 * len(num_corners)
     with_bend = np.column_stack([design.lens, design.bend])
     fitted = with_bend if heights_m.any() else design.lens

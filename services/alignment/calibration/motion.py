@@ -1,18 +1,15 @@
 """Twists, closed-form calibration of two sensors that move together, and what they must show.
 
 With X = T_tracker_camera and Z = T_world_board every view says T_world_tracker · X · T_camera_board
-= Z. Two views give A X = X B for their relative motions; the rotation vectors of A and B differ by
-R_X alone (Park and Martin 1994), which gives the rotation; the translation is linear. Motions that
-do not determine the result are refused, and views that disagree with the others are left out.
-
-A twist is [..., 6]: rotation vector in rad, then translation in m. T · move(twist) turns T in its
-own frame about its own origin and shifts it along its own axes.
+= Z; two give A X = X B for their motions (Park and Martin 1994). A twist is [..., 6]: rotation
+vector in rad, then translation in m. T · move(twist) turns T in its own frame about its own origin
+and shifts it along its own axes.
 """
 
 from typing import Final, NamedTuple
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
 from dextouch.geometry import invert, rigid_error, transform
@@ -47,6 +44,21 @@ MAX_OUTLIER_SHARE = 0.2
 EXACT = (np.deg2rad(0.01), 1e-4)
 # An inverted series is named where turning it round leaves less than this share of the error.
 INVERTED_SHARE = 0.2
+# Directions of which the fitted unknowns leave less than this say nothing of their own.
+MIN_INDEPENDENCE = 1e-4
+# Fitted unknowns may be nearly the same, of which a fit makes use to the last digit.
+MIN_INDEPENDENCE_OF_FITTED = 1e-10
+# Views belong to one place where both series moved less. Ten times and more the noise of a tracker,
+# and what a hand sways that holds a camera; the mean of such poses is exact to 0.1 mm.
+MAX_SAME_PLACE_RAD, MAX_SAME_PLACE_M = np.deg2rad(2.0), 0.01
+# Probability that a healthy calibration is refused for a change.
+MAX_CHANCE = 1e-6
+# Changes that are smaller than this many lengths of the expected noise are part of the sigmas.
+MIN_CHANGE = 2.0
+# Of neighbours; independent errors have less in 98 of 100 series.
+MIN_CORRELATION_SIGMAS = 2.0
+# Places on either side of a change; a pose has as many numbers as one of them.
+MIN_SIDE = 3
 
 
 class DegenerateMotionError(InvalidInputError):
@@ -69,10 +81,7 @@ class Series(NamedTuple):
 
 
 class Agreement(NamedTuple):
-    """Series of the views that agree, the mount X and the target's pose Z that they determine.
-
-    `views` are their indices, `left_out` those of the others.
-    """
+    """Series of the agreeing views, their indices, X and Z, and indices of views left out."""
 
     series: Series
     views: np.ndarray
@@ -88,12 +97,7 @@ class Agreement(NamedTuple):
 
 
 def checked_poses(task: str, **series: np.ndarray) -> list[Float64[np.ndarray, "n 4 4"]]:
-    """Validate series of poses: float64 [n, 4, 4], all of one length.
-
-    Raises:
-        ShapeError, NonFiniteError: no [n, 4, 4], or NaN.
-        InvalidInputError: no rigid transforms, or fewer than four.
-    """
+    """Series as float64 [n ≥ 4, 4, 4]; raises ShapeError, NonFiniteError, InvalidInputError."""
     arrays = {name: np.asarray(poses, dtype=np.float64) for name, poses in series.items()}
     shapes = [array.shape for array in arrays.values()]
     if len(set(shapes)) != 1 or len(shapes[0]) != 3 or shapes[0][1:] != (4, 4):
@@ -122,11 +126,7 @@ def view_pairs(num_views: int) -> np.ndarray:
 
 
 def check_turns(task: str, body: str, Ts_world_body: np.ndarray) -> None:
-    """Refuse poses [n, 4, 4] of a body that turns about a single axis, or hardly at all.
-
-    Raises:
-        DegenerateMotionError: names the axes of the body about which it was not turned.
-    """
+    """Refuse poses [n, 4, 4] that turn about one axis, or hardly; raises DegenerateMotionError."""
     pairs = view_pairs(len(Ts_world_body))
     A = invert(Ts_world_body[pairs[:, 1]]) @ Ts_world_body[pairs[:, 0]]
     turns_rad = vector_from_rotation(A[:, :3, :3])
@@ -160,9 +160,8 @@ def missing_axes(missing: np.ndarray) -> list[str]:
 def agreeing_views(series: Series, mount: np.ndarray | None = None) -> Agreement:
     """Mount (in closed form, unless it is given) and target, without outlier views.
 
-    Raises:
-        DegenerateMotionError: the views that agree show no mount.
-        InvalidInputError: the views contradict each other; an inverted series is named.
+    Raises DegenerateMotionError: the views that agree show no mount; InvalidInputError: the views
+    contradict each other (an inverted series is named).
     """
     num_views = len(series.Ts_world_body)
     views = np.arange(num_views)
@@ -173,7 +172,7 @@ def agreeing_views(series: Series, mount: np.ndarray | None = None) -> Agreement
             check_turns(series.task, series.body, used.Ts_world_body)
         X = park(used.Ts_world_body, used.Ts_mounted_target) if mount is None else mount
         Z, errors = view_errors(used, X)
-        if mount is None:
+        if mount is None and not (_rms(errors) < EXACT).all():
             check_sides(used, errors)
             check_scale(used, errors)
         ratios = (errors / np.maximum(np.median(errors, axis=0), EXACT)).max(axis=1)
@@ -245,18 +244,9 @@ def view_errors(
 
 
 def check_sides(series: Series, errors: np.ndarray) -> None:
-    """Refuse a series that fits much better when one side is inverted.
-
-    Consistency alone cannot show which side is wrong: with both turned round the views agree again,
-    on mount and target exchanged. The shorter mount is the likelier one.
-
-    Raises:
-        InvalidInputError: names the side.
-    """
+    """Refuse and name a side whose inverse fits much better, of two that of the shorter mount."""
     body, target = series.Ts_world_body, series.Ts_mounted_target
     limit = INVERTED_SHARE * _rms(errors)
-    if (_rms(errors) < EXACT).all():
-        return
     fits = []
     sides = ((invert(body), target), (body, invert(target)))
     for name, other in zip(series.names, sides, strict=True):
@@ -278,13 +268,7 @@ def check_sides(series: Series, errors: np.ndarray) -> None:
 
 
 def check_scale(series: Series, errors: np.ndarray) -> None:
-    """Refuse a target's series in another unit, or of a board of another size than was entered.
-
-    Raises:
-        InvalidInputError: names the series and its scale.
-    """
-    if (_rms(errors) < EXACT).all():
-        return
+    """Refuse a target's series in another unit or size than entered; raises InvalidInputError."""
     X, scale = scaled_park(series.Ts_world_body, series.Ts_mounted_target)
     if scale <= 0:
         return
@@ -345,10 +329,7 @@ def twist(T: np.ndarray) -> Float64[np.ndarray, "*batch 6"]:
 
 
 def right_jacobian_inverse(vectors_rad: np.ndarray) -> Float64[np.ndarray, "*batch 3 3"]:
-    """Inverse right Jacobian of SO(3) at a rotation vector.
-
-    For angles below half a turn (Solà et al. 2018, A micro Lie theory, eq. 144).
-    """
+    """Inverse right Jacobian of SO(3) below half a turn (Solà et al. 2018, eq. 144)."""
     angle = np.linalg.norm(vectors_rad, axis=-1)[..., None, None]
     small = angle < SERIES_ANGLE_RAD
     safe = np.where(small, 1.0, angle)
@@ -376,3 +357,170 @@ def nearest_rotation(matrix: np.ndarray) -> Float64[np.ndarray, "3 3"]:
     """The rotation nearest to a 3 by 3 matrix (orthogonal Procrustes)."""
     U, _, Vt = np.linalg.svd(matrix)
     return U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+
+
+def place_labels(series: Series, *, min_places: int = MIN_VIEWS) -> Int64[np.ndarray, " n"]:
+    """Place of each view, numbered by first visit; raises InvalidInputError for too few places."""
+    labels = np.full(len(series.Ts_world_body), -1)
+    num_places = 0
+    for index in range(len(labels)):
+        if labels[index] < 0:
+            is_near = labels < 0
+            for Ts in (series.Ts_world_body, series.Ts_mounted_target):
+                shifts_m = np.linalg.norm(Ts[:, :3, 3] - Ts[index, :3, 3], axis=1)
+                turns_rad = rotation_angle((invert(Ts[index]) @ Ts)[:, :3, :3])
+                is_near &= (turns_rad < MAX_SAME_PLACE_RAD) & (shifts_m < MAX_SAME_PLACE_M)
+            labels[is_near] = num_places
+            num_places += 1
+    if num_places < min_places:
+        raise InvalidInputError(
+            f"{series.task}: {len(labels)} views are of {num_places} places, expected at least "
+            f"{min_places}, better 20: views within {np.rad2deg(MAX_SAME_PLACE_RAD):.0f} degrees "
+            f"and {MAX_SAME_PLACE_M * 1e3:.0f} mm of each other count once"
+        )
+    return labels
+
+
+def mean_series(series: Series, labels: np.ndarray) -> Series:
+    """One view for each place, the mean of its views."""
+    body, target = (
+        np.array([nearest_pose(Ts[labels == place]) for place in range(labels.max() + 1)])
+        for Ts in (series.Ts_world_body, series.Ts_mounted_target)
+    )
+    return series._replace(Ts_world_body=body, Ts_mounted_target=target)
+
+
+def excess_over_time(
+    series: Series,
+    residuals: Float64[np.ndarray, "n 6"],
+    J: Float64[np.ndarray, "n 6 13"],
+    C: Float64[np.ndarray, "n 6 6"],
+    free: np.ndarray,
+    expected: tuple[float, float],
+) -> float:
+    """By how much variances exceed those of independent errors, from places in their order.
+
+    Residual twists [n, 6] are whitened; they change by J with mount, target and scale, the unknowns
+    `free` of which were fitted, and by C with errors of the body's poses, whose `expected` noise is
+    in rad and m an axis. Raises InvalidInputError: mount, target or the body's frame moved, or the
+    clocks differ.
+    """
+    num_places = len(residuals)
+    left, fitted = residuals.ravel(), J[:, :, free].reshape(6 * num_places, -1)
+    W = series.Ts_world_body
+    last, following = np.maximum(np.arange(num_places) - 1, 0), np.arange(1, num_places + 1)
+    passed = twist(invert(W[last]) @ W[np.minimum(following, num_places - 1)])
+    late = (C @ passed[..., None]).reshape(6 * num_places, 1)
+    changes = {}
+    for at in range(MIN_SIDE, num_places - MIN_SIDE + 1):
+        after = J * (np.arange(num_places) >= at)[:, None, None]
+        for name, unknowns in (("mount", slice(6)), ("target", slice(6, 12))):
+            functions = after[:, :, unknowns].reshape(6 * num_places, -1)
+            changes[name, at] = _change(left, fitted, functions)
+    changes["clock", 0] = _change(left, fitted, late)
+    (name, at), worst = min(changes.items(), key=lambda change: change[1].p_value)
+    size = worst.coefficients
+    if name == "clock":
+        size = size * np.sqrt(np.square(passed).mean(axis=0))
+    lengths = np.linalg.norm(size.reshape(2, 3), axis=1)
+    is_large = lengths > MIN_CHANGE * np.sqrt(3) * np.array(expected)
+    if worst.p_value * len(changes) < MAX_CHANCE and is_large.any():
+        raise InvalidInputError(_refusal(series, name, at, worst))
+    times = np.linspace(-1, 1, num_places)[:, None, None]
+    trends = (times * J[:, :, :12]).reshape(6 * num_places, -1)
+    found = structure(left, fitted, np.column_stack([trends, late]))
+    return max(found.ratio, _num_together(left), 1.0)
+
+
+class Structure(NamedTuple):
+    """How much of the residuals some functions explain.
+
+    Attributes:
+        ratio: mean square of what they explain over that of the rest (an F statistic).
+        p_value: how probable so large a ratio is for independent Gaussian errors.
+        explained: sum of squares that they explain.
+        rest: mean square of what they do not, by each of its `freedom` degrees of freedom.
+        coefficients: of the functions; `remaining` are the residuals that they do not explain.
+    """
+
+    ratio: float
+    p_value: float
+    explained: float
+    rest: float
+    freedom: int
+    coefficients: Float64[np.ndarray, " m"]
+    remaining: Float64[np.ndarray, " n"]
+
+
+def structure(
+    residuals: Float64[np.ndarray, " n"],
+    fitted: Float64[np.ndarray, "n p"],
+    functions: Float64[np.ndarray, "n m"],
+    *,
+    num_others: int = 0,
+    num_together: float = 1.0,
+) -> Structure:
+    """Test whether functions explain residuals of a fit better than chance.
+
+    Independent errors leave as much in any direction of the residuals as in any other. Residuals
+    are whitened; `fitted` says how they change with the unknowns that were fitted, `num_others`
+    counts fitted unknowns of which nothing is left in any of the three, `num_together` errors in
+    turn that are alike, and count as one.
+    """
+    # Here, since commands that measure nothing import this module on stations without scipy.
+    from scipy.special import fdtrc
+
+    U, s, _ = np.linalg.svd(fitted / _lengths(fitted), full_matrices=False)
+    Q = U[:, s > MIN_INDEPENDENCE_OF_FITTED]
+    lengths = _lengths(functions)
+    own = functions / lengths
+    own, left = own - Q @ (Q.T @ own), residuals - Q @ (Q.T @ residuals)
+    U, s, Vt = np.linalg.svd(own, full_matrices=False)
+    U, s, Vt = (part[s > MIN_INDEPENDENCE] for part in (U.T, s, Vt))
+    along = U @ left
+    explained, num = float(along @ along), len(s)
+    freedom = max(len(residuals) - num_others - Q.shape[1] - num, 1)
+    rest = max(float(left @ left) - explained, np.finfo(float).tiny) / freedom
+    ratio = explained / max(num, 1) / rest / num_together
+    p_value = float(fdtrc(max(num, 1), freedom / num_together, ratio))
+    return Structure(
+        ratio, p_value, explained, rest, freedom, (Vt.T @ (along / s)) / lengths, left - U.T @ along
+    )
+
+
+def _lengths(columns: np.ndarray) -> np.ndarray:
+    return np.maximum(np.linalg.norm(columns, axis=0), np.finfo(float).tiny)
+
+
+def _change(left: np.ndarray, fitted: np.ndarray, functions: np.ndarray) -> Structure:
+    """Test for a change among errors that may be alike from one place to the next."""
+    found = structure(left, fitted, functions)
+    return structure(left, fitted, functions, num_together=_num_together(found.remaining))
+
+
+def _num_together(residuals: np.ndarray) -> float:
+    """How many places in turn err alike, by the correlation of neighbours (autoregressive)."""
+    errors = residuals.reshape(-1, 6)
+    correlation = float((errors[1:] * errors[:-1]).sum() / np.square(errors).sum())
+    if correlation < MIN_CORRELATION_SIGMAS / np.sqrt(errors.size):
+        return 1.0
+    return (1 + correlation) / (1 - correlation)
+
+
+def _refusal(series: Series, name: str, at: int, worst: Structure) -> str:
+    turn_deg = np.rad2deg(np.linalg.norm(worst.coefficients[:3]))
+    if name == "clock":
+        return (
+            f"{series.task}: the poses of {series.names[0]} are of other times than those of "
+            f"{series.names[1]}, by {abs(worst.coefficients[0]) * 2:.2f} of the time from one "
+            "place to the next; hold still for each view, or calibrate the time offset first"
+        )
+    moved = {
+        "mount": f"the mount on the {series.body} slipped",
+        "target": f"the target or the frame of {series.names[0]} moved",
+    }[name]
+    return (
+        f"{series.task}: {moved} by {turn_deg:.2f} degrees and "
+        f"{np.linalg.norm(worst.coefficients[3:]) * 1e3:.1f} mm before place {at} of "
+        f"{len(series.Ts_world_body)}, in the order of the views; fasten it and take all views anew"
+    )

@@ -1,7 +1,4 @@
-"""Calibration of one glove from presses of known pressure: gain and state of each taxel.
-
-The result holds tare, gain and states as recordings carry them.
-"""
+"""Calibration of one glove from presses of known pressure: gain and state of each taxel."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -57,17 +54,9 @@ MAX_FAULTY = 0.25
 
 @dataclass(frozen=True)
 class TaxelPress:
-    """A take under known pressure on some of the taxels.
+    """A take [T ≥ 60, cells] under a pressure above 0 kPa on some taxels, with its sigma.
 
-    Args:
-        pressure_kpa: above 0; force / area for a weight.
-        sigma_kpa: one standard deviation of it, 0 or more.
-        counts: [T ≥ 60, cells] raw readings during the press.
-        taxels: which taxels (anatomical order) were pressed.
-
-    Raises:
-        InvalidInputError: a pressure that is not above 0, or no taxel.
-        NonFiniteError: NaN or infinity in the pressure.
+    Raises InvalidInputError: another pressure, or no taxel; NonFiniteError: NaN or infinity.
     """
 
     pressure_kpa: float
@@ -87,14 +76,12 @@ class TaxelPress:
 
 @dataclass(frozen=True)
 class TaxelGain:
-    """Gain of each taxel in counts per kPa, anatomical order.
+    """Gain of each taxel in counts per kPa, anatomical order; where refused, gain and sigma are 0.
 
     Attributes:
-        gain_counts_per_kpa: 0 where refused (`state` is not `OK`).
-        sigma_counts_per_kpa: of the gain, 0 where refused. It includes what is common to all
-            taxels: errors of the pressures, creep while a press lies, and a bend over pressure or a
-            drift from press to press where the presses show one. A single pressure shows no bend;
-            then it includes the largest that is tolerated.
+        sigma_counts_per_kpa: includes errors of the pressures, creep while a press lies, and a bend
+            over pressure or a drift from press to press; of a single pressure the largest bend that
+            is tolerated.
         state: index into `tactile_tare.STATES`.
         residual_kpa: [press, taxels] what each press is off the line, 0 where not used.
     """
@@ -115,9 +102,8 @@ class GloveCalibration:
     def matrices(self) -> dict[str, Float64[np.ndarray, "1 cells"]]:
         """Matrices by their names in recordings, in scan order and in the unit of the readings.
 
-        A taxel whose gain was refused gets the median gain of its pad, so that counts of a faulty
-        taxel stay finite; `…_state` says which ones (index into `tactile_tare.STATES`). Cells
-        without a taxel get the median of all.
+        A taxel whose gain was refused gets the median gain of its pad, cells without a taxel that
+        of all; `…_state` says which taxels (index into `tactile_tare.STATES`).
         """
         side, step = self.tare.side, reading_step(self.tare.layout)
         found = {
@@ -155,9 +141,7 @@ def calibrate_glove(
 ) -> GloveCalibration:
     """Gain and fault map of a glove, beside its tare; without presses the tare alone.
 
-    Raises:
-        InvalidInputError: as `fit_gain`, or more than a quarter of the taxels is faulty or
-            was not pressed.
+    Raises InvalidInputError: as `fit_gain`, or more than a quarter of the taxels is not OK.
     """
     if not presses:
         return GloveCalibration(tare, None)
@@ -179,11 +163,7 @@ def calibrate_glove(
 def filled_gain(
     gain: TaxelGain, layout: TactileLayout = DEXTOUCH_V1
 ) -> Float64[np.ndarray, " taxels"]:
-    """Gains in which refused taxels have the median of their pad, or of the glove.
-
-    Raises:
-        InvalidInputError: not one gain is known.
-    """
+    """Gains with the median of pad or glove for refused taxels; raises InvalidInputError."""
     known = gain.state == OK
     if not known.any():
         raise InvalidInputError("glove: the gain of no taxel is known")
@@ -197,17 +177,12 @@ def filled_gain(
 
 
 def _slices(layout: TactileLayout) -> dict[str, slice]:
-    """Taxels of each pad, by its part of the hand."""
     starts = zip(layout.pads, layout.starts, strict=True)
     return {pad.part: slice(start, start + pad.num_taxels) for pad, start in starts}
 
 
 def pad_taxels(names: str, layout: TactileLayout = DEXTOUCH_V1) -> Bool[np.ndarray, " taxels"]:
-    """Which taxels belong to pads, named with + between them, such as `thumb+index`, or `all`.
-
-    Raises:
-        UnknownNameError: no such pad.
-    """
+    """Taxels of pads such as `thumb+index`, or `all`; raises UnknownNameError for no such pad."""
     taxels, slices = np.zeros(layout.num_taxels, dtype=np.bool_), _slices(layout)
     for name in names.split("+"):
         if name == "all":
@@ -227,14 +202,10 @@ def fit_gain(
 ) -> TaxelGain:
     """Weighted straight line of counts over pressure through each taxel's tare.
 
-    A taxel is refused, with its state, where it does not answer, saturates in all presses, bends,
-    or was pressed too little for 10 % of gain; its gain is then 0 and must not be used. Several
-    pressures show a bent response.
-
-    Raises:
-        InvalidInputError: no press, no taxel that answers, counts that fall under pressure,
-            pressures that do not belong to the takes, or a glove whose response bends or drifts by
-            more than 10 %.
+    Taxels that do not answer, saturate in all presses, bend, or were pressed too little for 10 % of
+    gain are refused. Raises InvalidInputError: no press, no taxel that answers, counts that fall
+    under pressure, pressures that do not belong to the takes, or a glove that bends or drifts by
+    above 10 %.
     """
     if not presses:
         raise InvalidInputError("gain: got no press, expected at least one known pressure")
@@ -295,7 +266,6 @@ def _points(tare: TaxelTare, presses: Sequence[TaxelPress], full_scale_counts: f
 
 
 def _check_steady(raw: np.ndarray, level: Level, press: TaxelPress, tare: TaxelTare) -> None:
-    """Refuse takes in which the pressure was not constant."""
     half = len(raw) // 2
     creep = np.abs(np.median(raw[:half], axis=0) - np.median(raw[half:], axis=0))
     response = np.abs(level.mean_counts - tare.level.mean_counts)
@@ -316,18 +286,12 @@ def _creep(press: TaxelPress, tare: TaxelTare) -> float:
         tare.select(np.median(part, axis=0) - tare.level.mean_counts)
         for part in np.array_split(np.asarray(press.counts, dtype=np.float64), 2)
     )
-    answering = press.taxels & (first > MIN_MOVE_COUNTS)
-    return float(np.median(second[answering] / first[answering] - 1)) if answering.any() else 0.0
+    responding = press.taxels & (first > MIN_MOVE_COUNTS)
+    return float(np.median(second[responding] / first[responding] - 1)) if responding.any() else 0.0
 
 
 def _trend(points: _Points, gain: np.ndarray, good: np.ndarray) -> Float64[np.ndarray, " taxels"]:
-    """Error of gains, as a share, by trends of all taxels over pressure and from press to press.
-
-    Of a taxel that was pressed with one pressure, by the largest bend that is tolerated.
-
-    Raises:
-        InvalidInputError: it is too large; the trend is named.
-    """
+    """Error of gains, as a share, by trends of all taxels, or the largest bend tolerated."""
     used = points.used[:-1] & good & (gain > 0)
     highest_kpa = np.where(used, points.pressure_kpa[:-1], 0.0).max(axis=0)
     has_one = highest_kpa <= np.where(used, points.pressure_kpa[:-1], np.inf).min(axis=0)
@@ -374,19 +338,18 @@ def _trend(points: _Points, gain: np.ndarray, good: np.ndarray) -> Float64[np.nd
 
 
 def _check_direction(points: _Points) -> None:
-    """Refuse takes without any response, or in which counts fall under pressure."""
     response = (points.counts[:-1] - points.counts[-1])[points.used[:-1]]
-    answering = np.abs(response) >= MIN_MOVE_COUNTS
-    if points.saturated.any() and not answering.any():
+    responding = np.abs(response) >= MIN_MOVE_COUNTS
+    if points.saturated.any() and not responding.any():
         raise InvalidInputError(
             "gain: every pressed taxel is at full scale; press less, or lower the glove's gain"
         )
-    if not answering.any():
+    if not responding.any():
         raise InvalidInputError(
             f"gain: no pressed taxel moved by {MIN_MOVE_COUNTS:g} counts or more; check that the "
             "presses are those of this glove and side, and that the glove is connected"
         )
-    if (response[answering] < 0).mean() > 0.5:
+    if (response[responding] < 0).mean() > 0.5:
         raise InvalidInputError(
             "gain: counts fall under pressure; the rest take and a pressed take are probably "
             "exchanged, or this glove counts downwards and needs a decoder that inverts it"
@@ -394,7 +357,6 @@ def _check_direction(points: _Points) -> None:
 
 
 def _silent_under_pressure(points: _Points) -> Bool[np.ndarray, " taxels"]:
-    """Taxels without response in every press to which the others respond."""
     response, used = points.counts[:-1] - points.counts[-1], points.used[:-1]
     usual = [np.median(r[u]) if u.any() else 0.0 for r, u in zip(response, used, strict=True)]
     least = np.array(usual)[:, None]
@@ -404,10 +366,7 @@ def _silent_under_pressure(points: _Points) -> Bool[np.ndarray, " taxels"]:
 
 
 def _lines(points: _Points) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Gain, its sigma, zero and excess (χ² a degree of freedom) of each taxel's line.
-
-    The pressure's sigma enters through the gain, hence the rounds (York 1966, uncorrelated).
-    """
+    """Gain, its sigma, zero and excess (χ² a degree of freedom) of taxels' lines (York 1966)."""
     P, gain = points.pressure_kpa, np.zeros(points.counts.shape[1])
     for _ in range(ROUNDS):
         variance = points.sigma_counts**2 + (gain * points.sigma_kpa) ** 2

@@ -1,11 +1,9 @@
 """Tare of a glove, detection of faulty taxels, and conversion of raw counts to pressures in kPa.
 
-The tare is the reading and noise of each cell without contact. A taxel is only called faulty on
-evidence: its neighbours (or the others under the same known pressure) moved, and it did not. Where
-nothing around it moved it stays `unproven`.
+A taxel is only faulty if its neighbours, or others under the same pressure, moved, and it did not.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -14,6 +12,7 @@ from jaxtyping import Bool, Float32, Float64, Int64, Shaped, UInt8
 from numpy.lib.stride_tricks import sliding_window_view
 
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
+from dextouch.streams import MIN_SAMPLES_TO_JUDGE, TaxelFaults
 from dextouch.tactile.layout import DEXTOUCH_V1, Side, TactileLayout
 
 # One second of a 60 Hz glove; with less, drift cannot be separated from the zero.
@@ -55,14 +54,19 @@ NO_CELL = -1
 MIN_FULL_SCALE_KPA = 50.0
 
 Record = Mapping[str, Sequence[Sequence[float]]]
+# More taxels than this that are random, or below their tare: the glove or its tare is wrong.
+MAX_WRONG_TAXELS = 0.5
+# Fingertips press with up to some 1000 kPa.
+MAX_PRESSURE_KPA = 5000.0
+# No hand is pressed by so much everywhere; less is reported.
+MAX_ZERO_KPA = 100.0
 
 
 @dataclass(frozen=True)
 class Level:
     """Constant level of each cell over a take: mean of the readings without accidental contact.
 
-    `sigma_counts` is of that mean: noise, slow noise and the rounding to whole counts;
-    `noise_counts` the standard deviation of one reading; `clipped` the share of excluded readings.
+    `sigma_counts` is of that mean, `noise_counts` of one reading, `clipped` the share left out.
     """
 
     mean_counts: Float64[np.ndarray, " cells"]
@@ -73,11 +77,7 @@ class Level:
 
 @dataclass(frozen=True)
 class TaxelTare:
-    """The zero of each of the raw cells of one glove: their level without load.
-
-    `restless` taxels (anatomical order) moved during the take of so many samples; few are
-    tolerated.
-    """
+    """The zero of the raw cells of a glove without load; few taxels may be `restless` meanwhile."""
 
     side: Side
     level: Level
@@ -93,16 +93,9 @@ class TaxelTare:
 def measure_tare(
     rest_counts: np.ndarray, *, side: Side, layout: TactileLayout = DEXTOUCH_V1
 ) -> TaxelTare:
-    """Zero of every cell from a take without contact.
+    """Zero of every cell from raw counts [T ≥ 60, cells] without contact, in scan order.
 
-    Args:
-        rest_counts: [T ≥ 60, cells] raw counts in scan order.
-        side: of the glove.
-        layout: of the glove.
-
-    Raises:
-        InvalidInputError: too short, or the glove was touched or still settling.
-        ShapeError, NonFiniteError: no [T, cells], or NaN.
+    Raises InvalidInputError: too short, touched or settling; ShapeError; NonFiniteError.
     """
     counts = checked_counts(rest_counts, what=f"rest take of the {side} glove", layout=layout)
     level = steady_level(counts)
@@ -131,11 +124,10 @@ def steady_level(counts: Float64[np.ndarray, "time cells"]) -> Level:
 
 
 def rounding_rms_counts(noise_counts: np.ndarray) -> Float64[np.ndarray, "..."]:
-    """RMS error of the mean of rounded readings, over all true values.
+    """RMS error of the mean of rounded readings, over all true values; 1/√12 without noise.
 
-    Noise of `noise_counts` (with the rounding's own 1/12) dithers the steps away: the bias of a
-    rounded value x is Σ (−1)^k sin(2πkx) exp(−2π²k²σ²)/(πk) for Gaussian noise σ (Widrow and
-    Kollár, Quantization Noise, 2008); 1/√12 without noise.
+    Noise dithers the steps away: the bias of a rounded value x is Σ (−1)^k sin(2πkx)
+    exp(−2π²k²σ²)/(πk) for Gaussian noise σ (Widrow and Kollár, Quantization Noise, 2008).
     """
     variance = np.maximum(np.asarray(noise_counts, dtype=np.float64) ** 2 - 1 / 12, 0.0)
     orders = np.arange(1, 40)
@@ -146,13 +138,7 @@ def rounding_rms_counts(noise_counts: np.ndarray) -> Float64[np.ndarray, "..."]:
 def checked_counts(
     counts: np.ndarray, *, what: str, layout: TactileLayout = DEXTOUCH_V1
 ) -> Float64[np.ndarray, "time cells"]:
-    """Counts as float64.
-
-    Raises:
-        ShapeError: not [T, cells].
-        NonFiniteError: NaN or infinity.
-        InvalidInputError: too few readings.
-    """
+    """Counts [T, cells] as float64; raises ShapeError, NonFiniteError or InvalidInputError."""
     raw = np.asarray(counts, dtype=np.float64)
     if raw.ndim != 2 or raw.shape[1] != layout.num_raw_cells:
         raise ShapeError(f"{what}: got {raw.shape}, expected [T, {layout.num_raw_cells}]")
@@ -168,10 +154,7 @@ def checked_counts(
 def classify_taxels(
     takes: Sequence[np.ndarray], tare: TaxelTare, *, full_scale_counts: float = FULL_SCALE_COUNTS
 ) -> UInt8[np.ndarray, " taxels"]:
-    """State of each taxel (index into `STATES`, anatomical order) from takes with contact.
-
-    The takes are raw counts [T, cells] each; the rest take may be among them.
-    """
+    """State of each taxel (index into `STATES`) from takes [T, cells] with contact."""
     level, num_taxels = tare.level, tare.layout.num_taxels
     evidence, silent, moves = (np.zeros(num_taxels, dtype=np.int64) for _ in range(3))
     zero, noise = tare.select(level.mean_counts), tare.select(level.noise_counts)
@@ -206,10 +189,7 @@ def kind_of_silence(takes: Sequence[np.ndarray], tare: TaxelTare) -> UInt8[np.nd
 
 
 def _slow_noise_factor(counts: np.ndarray, noise: np.ndarray) -> float:
-    """By how much means of blocks spread more than independent readings would; at least 1.
-
-    One number for the whole glove: of a single cell's few blocks it would be a guess.
-    """
+    """By how much means of blocks spread more than independent readings; one number a glove."""
     size = len(counts) // NUM_BLOCKS
     blocks = counts[: size * NUM_BLOCKS].reshape(NUM_BLOCKS, size, -1).mean(axis=1)
     noisy = noise > 0.5
@@ -256,16 +236,13 @@ def _least_neighbour(
 
 @dataclass(frozen=True)
 class TactileCalibration:
-    """counts = tare + gain · pressure for each taxel of one glove of any maker.
+    """counts = tare + gain · pressure for each taxel, in anatomical order, of a glove.
 
     Attributes:
-        side: of the glove.
-        num_cells: numbers that the glove sends in each sample.
-        cells: raw cell of each taxel in anatomical order, −1 where the glove has none.
-        tare_counts: of each taxel, in the unit in which the glove sends its readings.
-        gain_counts_per_kpa: of each taxel, above 0; 1 where it is not measured.
+        cells: raw cell, of `num_cells` in a sample, of each taxel, −1 where the glove has none.
+        tare_counts: in the unit of the readings, whose smallest difference is `step`.
+        gain_counts_per_kpa: above 0; 1 where it is not measured.
         state: why a taxel is not measured, index into `REASONS`; 0 where it is.
-        step: smallest difference of two readings, in their unit.
 
     Raises:
         InvalidInputError: a gain that is not positive, or not one taxel that is measured.
@@ -301,22 +278,14 @@ class TactileCalibration:
         stream: str | None = None,
         layout: TactileLayout | None = None,
     ) -> "TactileCalibration":
-        """From a recording's calibration matrices.
+        """From a recording's calibration matrices of one side.
 
-        Args:
-            record: `tactile_<side>_tare_counts` and `…_gain_counts_per_kpa` (1 × cells), the latter
-                unless the unit of the layout says it; if there are any `…_taxel_state` (1 × cells)
-                and `…_cells` (1 × taxels), which a glove that names no layout must have unless it
-                sends 360 numbers.
-            side: of the glove.
-            num_cells: numbers that the glove sends in each sample; None: those of the layout.
-            stream: of a further glove of this side, whose matrices begin with its name.
-            layout: that the stream names; None of `dextouch_v1`.
-
-        Raises:
-            InvalidInputError: a matrix of this side is missing, has the wrong shape or invalid
-                values.
-            NonFiniteError: NaN or infinity.
+        These are `tactile_<side>_tare_counts`, `…_gain_counts_per_kpa` (1 × cells; the unit of the
+        layout may say it) and, if any, `…_taxel_state` (1 × cells) and `…_cells` (1 × taxels;
+        needed by a glove without layout that sends other than 360 numbers). `num_cells` is that of
+        a sample, None that of the `layout`, which is `dextouch_v1` if None; `stream` begins the
+        names of a further glove. It raises InvalidInputError or NonFiniteError for a matrix that is
+        missing or invalid.
         """
         glove, about = stream or f"tactile_{side}", layout or DEXTOUCH_V1
         num_cells = about.num_raw_cells if num_cells is None else num_cells
@@ -334,15 +303,10 @@ class TactileCalibration:
     def to_kpa(
         self, counts: np.ndarray, *, refused: np.ndarray | None = None
     ) -> Float32[np.ndarray, "time taxels"]:
-        """Pressures in anatomical order; zero below the tare, NaN where the reading is.
+        """Pressures of readings [T, cells] in anatomical order; zero below the tare, NaN as read.
 
-        Args:
-            counts: [T, cells] raw readings of the glove.
-            refused: uint8 [taxels] of `unusable_taxels`, taxels that are set to zero; by default
-                those that the calibration refuses.
-
-        Raises:
-            ShapeError: not [T, cells].
+        Taxels are zero that `refused` says (uint8 [taxels] of `unusable_taxels`), by default those
+        that the calibration refuses. Raises ShapeError: not [T, cells].
         """
         offsets = self.taxels(counts).astype(np.float64) - self.tare_counts
         taxels = np.maximum(offsets / self.gain_counts_per_kpa, 0.0)
@@ -350,11 +314,7 @@ class TactileCalibration:
         return taxels.astype(np.float32)
 
     def taxels(self, counts: np.ndarray) -> Shaped[np.ndarray, "time taxels"]:
-        """Readings [T, cells] by taxel; where there is no cell, those of any other.
-
-        Raises:
-            ShapeError: not [T, cells].
-        """
+        """Readings [T, cells] by taxel; where there is no cell, those of any. Raises ShapeError."""
         raw = np.asarray(counts)
         if raw.ndim != 2 or raw.shape[1] != self.num_cells:
             raise ShapeError(
@@ -364,10 +324,7 @@ class TactileCalibration:
 
 
 def reading_step(layout: TactileLayout) -> float:
-    """Smallest difference of two readings: one count, of other units a part in 65535 of full scale.
-
-    What floats resolve is not known; 16 bits are what the converters of such gloves have.
-    """
+    """Smallest difference of two readings: a count, or a part in 65535 of full scale."""
     return 1.0 if layout.unit == "counts" else layout.full_scale / FULL_SCALE_COUNTS
 
 
@@ -444,7 +401,6 @@ def _cells(
 
 
 def _states(record: Record, name: str, num_cells: int) -> UInt8[np.ndarray, " cells"]:
-    """States of the raw cells; all OK in a calibration without them."""
     if name not in record:
         return np.full(num_cells, OK, dtype=np.uint8)
     states = _row(record, name, num_cells)
@@ -455,3 +411,72 @@ def _states(record: Record, name: str, num_cells: int) -> UInt8[np.ndarray, " ce
             f"{int(np.argmax(unknown))}, expected 0 … {len(STATES) - 1} ({', '.join(STATES)})"
         )
     return states.astype(np.uint8)
+
+
+def taxel_faults(
+    calibration: TactileCalibration,
+    pieces: Iterable[np.ndarray],
+    layout: TactileLayout = DEXTOUCH_V1,
+) -> TaxelFaults:
+    """What consecutive raw readings [T, cells] of a take say of its taxels; raises ShapeError."""
+    take = TaxelFaults(
+        calibration.tare_counts,
+        calibration.gain_counts_per_kpa,
+        usable=calibration.state == OK,
+        step=calibration.step,
+        layout=layout,
+    )
+    for counts in pieces:
+        take.add(calibration.taxels(counts).astype(np.float64))
+    return take
+
+
+def unusable_taxels(
+    calibration: TactileCalibration, take: TaxelFaults
+) -> UInt8[np.ndarray, " taxels"]:
+    """Why each taxel of a take is unusable, index into `REASONS`; 0 if usable.
+
+    Besides those that the calibration refuses: dead, stuck, random, a copy of another cell, mostly
+    below the tare, still while those around them move, or NaN in more than a tenth of the samples.
+    Raises InvalidInputError: more than half of the taxels are random, copied, dead, stuck or below
+    their tare, some read more than any finger presses, or all more than their tare.
+    """
+    reasons = calibration.state.copy()
+    if take.num_samples < MIN_SAMPLES_TO_JUDGE:
+        return reasons
+    _check_pressures(calibration, take)
+    for fault, taxels in take.faults().items():
+        reasons[(reasons == OK) & taxels] = REASONS.index(fault)
+    for reason, what, advice in (
+        (RANDOM, "have nothing to do with the ones before", "check cable, port and protocol"),
+        (DEAD, "are zero throughout or from some moment on", "check cable and power"),
+        (COPIED, "are those of others", "check cable and firmware"),
+        (STUCK, "never change, or no more from some moment on", "restart the glove"),
+        (BELOW_TARE, "lie below their tare", "tare the glove again"),
+    ):
+        share = float((reasons == reason)[calibration.state == OK].mean())
+        if share > MAX_WRONG_TAXELS:
+            raise InvalidInputError(
+                f"{calibration.side} glove: readings of {share:.0%} of its taxels {what}; {advice}",
+                fault=REASONS[reason],
+            )
+    return reasons
+
+
+def _check_pressures(glove: TactileCalibration, take: TaxelFaults) -> None:
+    """Refuse readings that no finger gives, as a gain per Pa or another tare make them."""
+    highest_kpa = float(np.sort(take.highest_kpa()[glove.state == OK])[-3:].min())
+    if highest_kpa > MAX_PRESSURE_KPA:
+        raise InvalidInputError(
+            f"{glove.side} glove: three taxels read {highest_kpa:.3g} kPa or more, expected at "
+            f"most {MAX_PRESSURE_KPA:g} kPa; its gain looks like counts/Pa: calibrate it again",
+            fault="unit",
+        )
+    zero_kpa = float(np.median(take.zero_kpa))
+    if zero_kpa > MAX_ZERO_KPA:
+        raise InvalidInputError(
+            f"{glove.side} glove: even its least pressed taxels read {zero_kpa:.3g} kPa for most "
+            f"of the time, expected at most {MAX_ZERO_KPA:g} kPa; tare the glove again (are "
+            "readings inverted?)",
+            fault="baseline",
+        )

@@ -1,14 +1,4 @@
-"""Time offset between two streams, from common motion or from taps on a table.
-
-Signals of the same motion are low-passed without phase, correlated coarsely over all allowed
-offsets, and then fitted: b's cubic spline, moved by the offset, scaled and shifted, is brought onto
-a by Gauss–Newton. The offset's sigma comes from the fit; brisk motion makes it small, a high
-correlation alone does not.
-
-Taps are the fallback for a glove and a tracker, which have no motion in common: the glove's
-pressure starts between two samples; the tracker's height falls on a line and stops: a hinge, whose
-bend is the touch. The second difference would show the bend too early, so the hinge is fitted.
-"""
+"""Time offset between two streams, from common motion or from taps on a table."""
 
 from dataclasses import dataclass
 
@@ -52,11 +42,8 @@ def estimate_time_offset(
 ) -> TimeOffset:
     """Estimate the offset between two streams that measured the same motion.
 
-    Args:
-        t_a_ns: stamps [n] of stream a, int64, strictly increasing.
-        signal_a: [n] or [n, k]: angular speed, or k components in common axes (better).
-        t_b_ns: stamps [m] of stream b.
-        signal_b: [m] or [m, k]; may have another unit and zero than a.
+    Stamps [n] and [m] are int64, strictly increasing; signals are [n] or [n, k]: angular speed, or
+    k components in common axes (better). That of b may have another unit and zero.
 
     Raises:
         DegenerateMotionError: no motion, too slow, too periodic, or not the same one.
@@ -93,21 +80,13 @@ def estimate_tap_offset(
     t_height_ns: np.ndarray,
     height_m: np.ndarray,
 ) -> TimeOffset:
-    """Estimate the offset between pressure and height from taps at least 0.5 s apart.
+    """Offset to be added to a tracker's stamps to align it with a glove, from taps on a table.
 
-    Args:
-        t_pressure_ns: stamps [n], int64, strictly increasing.
-        pressure_kpa: the tapping pad's pressure [n]; below 2 kPa in the air.
-        t_height_ns: stamps [m] of the tracker.
-        height_m: height [m] above the table, of a point of the hand.
-
-    Returns:
-        The offset to add to the tracker's timestamps to align them with the glove's.
-
-    Raises:
-        DegenerateMotionError: no tap, or none that falls briskly onto the table.
-        InvalidInputError: stamps out of order.
-        ShapeError, NonFiniteError: values that do not fit or hold NaN.
+    Stamps [n] and [m] are int64, strictly increasing. The tapping pad's pressure [n] is below 2 kPa
+    in the air, the height [m] (m) that of a point of the hand above the table; taps are at least
+    0.5 s apart. Raises DegenerateMotionError: no tap, or none that falls briskly onto the table;
+    InvalidInputError: stamps out of order; ShapeError, NonFiniteError: values that do not fit, or
+    NaN.
     """
     start_ns = t_pressure_ns[:1]
     pressure, height = np.asarray(pressure_kpa)[..., None], np.asarray(height_m)[..., None]
@@ -134,12 +113,7 @@ def estimate_tap_offset(
 def checked_signal(
     what: str, t_ns: np.ndarray, signal: np.ndarray, reference_ns: np.ndarray
 ) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, "n k"]]:
-    """Times of a signal in seconds after a reference [1], and its values [n] or [n, k] as [n, k].
-
-    Raises:
-        InvalidInputError: fewer than two stamps, or stamps out of order.
-        ShapeError, NonFiniteError: values that do not fit or hold NaN.
-    """
+    """Seconds after a reference, and values [n, k]; refuses NaN and stamps that go back."""
     t_ns, values = np.asarray(t_ns, dtype=np.int64), np.asarray(signal, dtype=np.float64)
     values = values[:, None] if values.ndim == 1 else values
     if values.ndim != 2 or t_ns.shape != values.shape[:1]:

@@ -1,10 +1,4 @@
-"""Checks that tracked keypoints are the expected human hand in metres, in our order of nodes.
-
-Distances that no posture changes reveal the unit and the order of nodes. Other orders, which
-trackers and their users are known to produce, are compared with the mean hand as well: the best is
-named. A mirror image keeps all distances; the direction in which fingers curl distinguishes left
-from right.
-"""
+"""Checks that tracked keypoints are the expected human hand in metres, in our order of nodes."""
 
 from functools import lru_cache
 from itertools import combinations, permutations, product
@@ -55,11 +49,7 @@ MIN_THUMB_HEIGHT_M: Final = 0.003
 def checked_keypoints(
     keypoints_m: np.ndarray, *, where: str = "keypoints"
 ) -> Float64[np.ndarray, "time 25 3"]:
-    """The keypoints as contiguous float64.
-
-    Raises:
-        ShapeError: not [T ≥ 1, 25, 3].
-    """
+    """The keypoints as contiguous float64; raises ShapeError: not [T ≥ 1, 25, 3]."""
     keypoints = np.ascontiguousarray(keypoints_m, dtype=np.float64)
     if keypoints.ndim != 3 or keypoints.shape[1:] != (NUM_KEYPOINTS, 3) or not len(keypoints):
         raise ShapeError(f"{where}: got shape {keypoints.shape}, expected [T ≥ 1, 25, 3]")
@@ -78,9 +68,7 @@ def seen_nodes(keypoints_m: np.ndarray) -> Float64[np.ndarray, "time 25 3"]:
 def seen_samples(keypoints_m: np.ndarray, *, where: str) -> Float64[np.ndarray, "time 25 3"]:
     """Up to 300 samples, evenly spread over those that show the palm; NaN where a node is not seen.
 
-    Raises:
-        ShapeError: not [T ≥ 1, 25, 3].
-        InvalidInputError: no sample shows four nodes of the palm.
+    Raises ShapeError: not [T ≥ 1, 25, 3]; InvalidInputError: none shows four nodes of the palm.
     """
     looked_at = seen_nodes(thinned(checked_keypoints(keypoints_m, where=where), MAX_LOOKED_AT))
     num_seen = np.isfinite(looked_at[:, PALM_NODES, 0]).sum(axis=1)
@@ -102,12 +90,9 @@ def thinned(samples: np.ndarray, most: int) -> np.ndarray:
 def check_hand_shape(keypoints_m: np.ndarray, *, where: str = "keypoints") -> float:
     """Size of a hand (1: the mean adult); refuses what is none in metres, in our order of nodes.
 
-    Keypoints are in any axes, of either hand; a node that is not seen is NaN.
-
-    Raises:
-        InvalidInputError: another unit or order of nodes (named where it is known: `details`
-            holds `fault` and `found`), or no hand, or too few nodes.
-        ShapeError: not [T ≥ 1, 25, 3].
+    Keypoints are in any axes, of either hand; a node that is not seen is NaN. Raises ShapeError:
+    not [T ≥ 1, 25, 3]; InvalidInputError: another unit or order of nodes (if it is known, `details`
+    holds `fault` and `found`), no hand, or too few nodes.
     """
     distances = _median_distances(seen_samples(keypoints_m, where=where))
     sizes, misfits = _compared(distances, _orders()[1])
@@ -152,13 +137,9 @@ def check_handedness(
 ) -> Side | None:
     """The side that a hand shows, None where it shows neither; refuses the mirror image.
 
-    Fingers bend to the palm only, so bones turn about an axis that points to the thumb on a right
-    hand and away from it on a left one. If they hardly bend, the base of the thumb is used, which
-    is on the palm's side of the metacarpals.
-
-    Raises:
-        InvalidInputError: they are of the other hand.
-        ShapeError: not [T ≥ 1, 25, 3].
+    Bones turn about an axis that points to the thumb on a right hand; if they hardly bend, the base
+    of the thumb decides, which is on the palm's side of the metacarpals. Raises InvalidInputError:
+    they are of the other hand; ShapeError: not [T ≥ 1, 25, 3].
     """
     samples = seen_samples(keypoints_m, where=where)
     across = samples[:, KNUCKLE_NODES[0]] - samples[:, KNUCKLE_NODES[-1]]
@@ -185,10 +166,7 @@ def check_handedness(
 
 
 def _thumb_height_m(samples: np.ndarray, across: np.ndarray) -> float:
-    """Height of the thumb's base over wrist and knuckles, along a right hand's palm normal.
-
-    At the size of the mean hand.
-    """
+    """Height of the thumb's base along a right hand's palm normal, at the size of the mean hand."""
     knuckles = samples[:, KNUCKLE_NODES].mean(axis=1)
     palm = knuckles - samples[:, WRIST_NODE]
     normal = np.cross(across, palm)
@@ -198,7 +176,6 @@ def _thumb_height_m(samples: np.ndarray, across: np.ndarray) -> float:
 
 
 def _mean_ratio(values: np.ndarray, scale: np.ndarray) -> float:
-    """Mean of the finite ratios; zero if there are none."""
     ratios = np.divide(values, scale, out=np.full_like(scale, np.nan), where=scale > 0)
     known = ratios[np.isfinite(ratios)]
     return float(known.mean()) if known.size else 0.0

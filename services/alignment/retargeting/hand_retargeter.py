@@ -1,9 +1,4 @@
-"""`HandRetargeter`: joint angles of a robot hand that follow a tracked human hand, by its profile.
-
-Tracked points wobble by millimetres; bones do not. Bone lengths and the places of the knuckles in
-the wrist frame are therefore measured once a person, from calibration samples or from a whole
-recording, and later samples are checked against them and solved with them.
-"""
+"""`HandRetargeter`: joint angles of a robot hand that follow a tracked human hand."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -28,8 +23,7 @@ from services.alignment.retargeting.solver.arrays import (
     joint_places,
     zero_points_m,
 )
-from services.alignment.retargeting.solver.smoothing import smoothed
-from services.alignment.retargeting.solver.solve import retarget_samples
+from services.alignment.retargeting.solver.solve import retarget_samples, smoothed
 
 NUM_FINGERS = 5
 # Proximal phalanx of an index finger: that of the mean hand (39.7 mm) at the sizes that are
@@ -78,8 +72,8 @@ class HandProfile:
     Attributes:
         bone_m: MCP–PIP, PIP–DIP, DIP–tip (of the thumb CMC–MCP, MCP–IP, IP–tip).
         knuckle_m: the MCP (of the thumb: the CMC) in the wrist frame.
-        travel: how much of the travel that the robot's knuckle makes with flexion the tracked one
-            makes: 0 for people, whose knuckles turn in place, 1 for the robot hand itself.
+        travel: share of the robot's knuckle travel with flexion that the tracked one makes: 0 for
+            people, whose knuckles turn in place, 1 for the robot hand itself.
         knuckle_sigma_m: standard deviation per axis of a knuckle's residual motion.
         point_sigma_m: standard deviation, an axis, of the tracker's noise.
     """
@@ -104,31 +98,18 @@ class HandProfile:
 
     @property
     def is_rigid(self) -> bool:
-        """Whether this is the robot's own hand (or a copy), with exact bones and knuckles.
-
-        People's tracked bones and knuckles shift by millimetres with the posture; to hold them
-        fixed would bend fingers that are straight.
-        """
+        """Whether this is the robot's own hand; those of people shift with the posture."""
         return bool(np.median(self.travel) >= RIGID_TRAVEL)
 
     def to_rows(self) -> Float64[np.ndarray, "5 9"]:
-        """As a matrix for a recording's calibration.
-
-        Columns: 3 bones (m), 3 knuckle coordinates (m), travel, knuckle sigma (m), the tracker's
-        noise (m; the same in every row).
-        """
+        """Rows: 3 bones, 3 knuckle coordinates, travel, knuckle sigma, the tracker's noise (m)."""
         noise_m = np.full(NUM_FINGERS, self.point_sigma_m)
         columns = self.bone_m, self.knuckle_m, self.travel, self.knuckle_sigma_m, noise_m
         return np.column_stack(columns).astype(np.float64)
 
     @classmethod
     def from_rows(cls, rows: Sequence[Sequence[float]]) -> "HandProfile":
-        """From the matrix of `to_rows`.
-
-        Raises:
-            ShapeError: not [5, 9].
-            InvalidInputError: not finite, or not a valid hand.
-        """
+        """From the matrix of `to_rows`; raises ShapeError or InvalidInputError."""
         table = np.asarray(rows, dtype=np.float64)
         if table.shape != (NUM_FINGERS, NUM_COLUMNS):
             raise ShapeError(f"hand profile: got shape {table.shape}, expected [5, {NUM_COLUMNS}]")
@@ -143,21 +124,13 @@ def profile_name(side: str) -> str:
 def calibrated_profile(
     calibration: Mapping[str, Sequence[Sequence[float]]], side: str
 ) -> HandProfile | None:
-    """The hand profile of a recording's calibration; None if it has none.
-
-    Raises:
-        ShapeError, InvalidInputError: it is not a valid hand.
-    """
+    """The profile of a calibration, None if it has none; raises ShapeError, InvalidInputError."""
     rows = calibration.get(profile_name(side))
     return None if rows is None else HandProfile.from_rows(rows)
 
 
 def check_bone_unit(index_proximal_m: float, *, where: str) -> None:
-    """Refuse an index finger's proximal bone that is not 19.0–66.8 mm long.
-
-    Raises:
-        InvalidInputError: most likely millimetres, or nodes in another order.
-    """
+    """Refuse an index finger's proximal bone outside 19.0–66.8 mm; raises InvalidInputError."""
     low, high = INDEX_PROXIMAL_RANGE_M
     if not low <= index_proximal_m <= high:
         is_in_mm = low * 1e3 <= index_proximal_m <= high * 1e3
@@ -170,10 +143,7 @@ def check_bone_unit(index_proximal_m: float, *, where: str) -> None:
 
 
 def person_arrays(profile: HandProfile | None, hand: HandModel) -> np.ndarray:
-    """Record `PERSON` for the fingers that the robot hand has.
-
-    Without a profile, bones and knuckles of each sample are used.
-    """
+    """Record `PERSON` for the robot's fingers; without a profile, each sample has its own bones."""
     record = np.zeros(1, dtype=PERSON)
     person, num, own_m = record[0], len(hand.fingers), robot_bone_m(hand)
     if profile is None:
@@ -214,14 +184,9 @@ def robot_bone_m(hand: HandModel) -> Float64[np.ndarray, "fingers 3"]:
 def measure_profile(keypoints_m: np.ndarray, hand: HandModel) -> HandProfile:
     """Medians of bones and knuckles, and how the knuckles travel when fingers bend.
 
-    Args:
-        keypoints_m: [T, 25, 3] any samples of the hand; those with whole fingers count.
-        hand: the robot hand of the same side, whose axes define how far fingers are bent.
-
-    Raises:
-        ShapeError: wrong shape.
-        InvalidInputError: a finger is complete in no sample, or its bone lengths are invalid (unit,
-            order).
+    Keypoints are [T, 25, 3], any samples of the hand, of which those with whole fingers count; the
+    robot hand of the same side defines how far fingers are bent. Raises ShapeError: wrong shape;
+    InvalidInputError: a finger is complete in no sample, or its bones are invalid (unit, order).
     """
     # Knuckle, PIP, DIP and tip of thumb … little (of the thumb: CMC, MCP, IP, tip).
     points_m = checked_keypoints(keypoints_m)[:, _NODES]
@@ -288,7 +253,6 @@ def _knuckle_motion(points_m: np.ndarray, hand: HandModel) -> Float64[np.ndarray
 def _fit_knuckle(
     seen_m: np.ndarray, moved_m: np.ndarray
 ) -> tuple[Float64[np.ndarray, "3"], float, float]:
-    """Position, travel and residual (standard deviation per axis) of one knuckle."""
     if not np.isfinite(moved_m).all():
         moved_m = np.zeros_like(seen_m)
     centred = moved_m - moved_m.mean(axis=0)
@@ -313,8 +277,8 @@ class RetargetResult:
         joints_rad: angles in the order of the hand's joints (Wuji: 20, firmware order).
         status: `RetargetStatus` a sample.
         finger_status: `RetargetStatus` of every finger.
-        tip_error_m: distance of each fingertip from its measured place, both seen from the
-            knuckle, at the person's size; zero where `solved` is False, since there is none.
+        tip_error_m: distance of each fingertip from its measured place, both seen from the knuckle,
+            at the person's size; zero where `solved` is False.
         solved: which fingers followed points of this sample.
     """
 
@@ -328,17 +292,10 @@ class RetargetResult:
 class HandRetargeter:
     """Follows a tracked hand with the robot hand of the same side.
 
-    `retarget` may run in several threads at once; `step` continues from the previous sample, so a
-    retargeter can be used for one live stream only.
-
-    Args:
-        hand: "left" or "right" for the Wuji hand, or any hand with keypoints of its side.
-        profile: of the person; if None, it is measured from the recording (`retarget`) or each
-            sample is used alone (`step`).
-        options: of the solver.
-
-    Raises:
-        UnknownNameError: any other side.
+    `retarget` may run in several threads at once; `step` continues from the previous sample of one
+    live stream. The hand is "left" or "right" for the Wuji hand, or any one with keypoints of its
+    side. A profile of None is measured from the recording (`retarget`), or each sample is used
+    alone (`step`).
     """
 
     def __init__(
@@ -364,13 +321,8 @@ class HandRetargeter:
     def reset(self, joints_rad: np.ndarray | None = None) -> None:
         """Forget all samples: the next `step` searches from several starts.
 
-        Args:
-            joints_rad: [J], where the robot's joints are; the next outputs lead from there at the
-                rate limit. None knows of no joints: the next output is wherever the hand is.
-
-        Raises:
-            ShapeError: not one angle a joint.
-            InvalidInputError: angles that are not finite.
+        The next outputs lead at the rate limit from the robot's joints [J], if given. Raises
+        ShapeError: not one angle a joint; InvalidInputError: angles that are not finite.
         """
         self._memory = self._blank()
         self._was_sent = joints_rad is not None
@@ -384,23 +336,13 @@ class HandRetargeter:
         self._memory.joints_rad[self._is_joint] = np.clip(angles, hand.lower_rad, hand.upper_rad)
 
     def step(self, keypoints_m: np.ndarray, elapsed_s: float = NOMINAL_PERIOD_S) -> RetargetResult:
-        """Joint angles of the next sample, live; fingers that are not tracked hold their angles.
+        """Joint angles of the next sample (T = 1), live; untracked fingers hold their angles.
 
-        No joint goes further from one output to the next than `velocity_limit_rad_s` allows in the
-        time elapsed, nor than `max_step_rad`, whatever was lost before: a finger that is found
-        again is REACQUIRED until it has caught up. Only the first output after the start or
-        `reset` is where the hand is; give `reset` the robot's angles to begin there.
-
-        Args:
-            keypoints_m: [25, 3], metres, wrist axes; NaN marks a missing node.
-            elapsed_s: since the sample before.
-
-        Returns:
-            A result of one sample (T = 1).
-
-        Raises:
-            ShapeError: wrong shape.
-            InvalidInputError: elapsed time not positive and finite.
+        Keypoints are [25, 3] in wrist axes (m), NaN where missing, `elapsed_s` after the sample
+        before. No joint goes further than `velocity_limit_rad_s` allows in the time elapsed, nor
+        than `max_step_rad`: a finger that is found again is REACQUIRED until it has caught up. Only
+        the first output after the start or `reset` is where the hand is. Raises ShapeError: wrong
+        shape; InvalidInputError: elapsed time not positive and finite.
         """
         keypoints = np.ascontiguousarray(keypoints_m, dtype=np.float64)
         if keypoints.shape != (NUM_KEYPOINTS, 3):
@@ -422,16 +364,10 @@ class HandRetargeter:
     ) -> RetargetResult:
         """Joint angles of a whole recording; untracked stretches are interpolated in time.
 
-        Args:
-            keypoints_m: [T, 25, 3], metres, wrist axes; NaN marks a missing node.
-            valid: bool [T, 25], False for nodes that are not to be used; None uses all that are
-                not NaN.
-            t_s: [T] rising times, relative to any moment; None takes 60 Hz.
-
-        Raises:
-            ShapeError: wrong shapes.
-            InvalidInputError: times that do not rise, wrong unit, or a finger that is tracked, but
-                followed in no sample. Joints of one that is never tracked are at rest.
+        Keypoints are [T, 25, 3] in wrist axes (m), NaN, or False in `valid` [T, 25], where they are
+        not to be used; times [T] rise (60 Hz if None). Raises ShapeError: wrong shapes;
+        InvalidInputError: times that do not rise, wrong unit, or a finger that is tracked, but
+        followed in no sample. Joints of one that is never tracked are at rest.
         """
         keypoints = checked_keypoints(keypoints_m)
         if valid is not None:
@@ -455,24 +391,16 @@ class HandRetargeter:
         if not result.solved.any():
             is_tracked[:] = True
         fingers = zip(self.hand.fingers, is_tracked & ~result.solved.any(axis=0), strict=True)
-        if never := [finger.chain for finger, is_other in fingers if is_other]:
+        if lost := [finger.chain for finger, is_other in fingers if is_other]:
             raise InvalidInputError(
-                f"keypoints of the {self.hand.side} hand: {', '.join(never)} followed in no sample "
+                f"keypoints of the {self.hand.side} hand: {', '.join(lost)} followed in no sample "
                 "(bones or knuckles are not those of the profile, or nodes are missing); expected "
                 "every finger that is tracked at least once"
             )
         return replace(result, joints_rad=self._filled(result, np.cumsum(elapsed_s)))
 
     def measure(self, keypoints_m: np.ndarray) -> HandProfile:
-        """Measure the profile of a person from calibration samples.
-
-        Args:
-            keypoints_m: [T, 25, 3] of an open, closing and spreading hand.
-
-        Raises:
-            ShapeError: wrong shape.
-            InvalidInputError: wrong unit, or a finger that is complete in no sample.
-        """
+        """A person's profile from an open, closing, spreading hand (`measure_profile`)."""
         return measure_profile(keypoints_m, self.hand)
 
     def _blank(self) -> Memory:
@@ -493,10 +421,7 @@ class HandRetargeter:
         )
 
     def _filled(self, result: RetargetResult, t_s: np.ndarray) -> np.ndarray:
-        """Angles with untracked stretches of fingers filled linearly, in time; held at ends.
-
-        So the rate limit, which the samples around keep, holds within as well.
-        """
+        """Angles with untracked stretches of fingers filled linearly, in time; held at ends."""
         filled = result.joints_rad.copy()
         for joint, finger in enumerate(np.nonzero(self._is_joint)[0]):
             known = result.solved[:, finger]
@@ -516,11 +441,7 @@ def warm_up() -> None:
 
 
 def _with_every_finger(keypoints_m: np.ndarray, side: str) -> Float64[np.ndarray, "time 25 3"]:
-    """Keypoints with the mean hand's nodes of fingers that are complete in no sample.
-
-    So that a person whose finger is never seen, or missing, has a profile of the others. Trackers
-    may lack the metacarpals of all fingers, which no profile has.
-    """
+    """Keypoints with the mean hand's nodes of fingers that are complete in no sample."""
     filled = keypoints_m
     for chain in CHAINS:
         nodes = solver_indices(chain)

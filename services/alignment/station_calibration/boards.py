@@ -62,11 +62,9 @@ TILTS = {
 
 @dataclass(frozen=True)
 class BoardView:
-    """Corners of the board detected in one photo.
+    """Corners of the board, whose print is `pattern`, in one photo; `is_blurred` ones are left out.
 
-    `points_board` are positions on the board (m), `pixels` follow OpenCV: the centre of the first
-    pixel is 0, 0. `pattern` is the board's print. `is_blurred` photos must be excluded: camera or
-    board moved, and the corners are inaccurate.
+    `points_board` are in m, `pixels` follow OpenCV: the centre of the first pixel is 0, 0.
     """
 
     name: str
@@ -93,10 +91,7 @@ class Lens:
 
 @dataclass(frozen=True)
 class Photos:
-    """Photos of one size: views of the board, and the names of those left out.
-
-    `without_board` includes photos in which the board seems to be printed in another way.
-    """
+    """Photos of one size: views of the board, and names of those without this print of it."""
 
     views: tuple[BoardView, ...]
     without_board: tuple[str, ...]
@@ -123,12 +118,7 @@ class Photos:
 
 
 def parse_board(text: str) -> Board:
-    """Parse a board description (`BOARD_HELP`).
-
-    Raises:
-        InvalidInputError: invalid syntax.
-        UnknownNameError: no such kind of board or dictionary.
-    """
+    """Parse a board (`BOARD_HELP`); raises InvalidInputError, or UnknownNameError of a kind."""
     kind, _, sizes = text.partition(":")
     if kind not in _SIZES:
         raise UnknownNameError("board", kind, list(_SIZES))
@@ -154,10 +144,7 @@ def photo_paths(folder: Path) -> list[Path]:
 
 
 def decode_photo(data: bytes, *, where: str) -> UInt8[np.ndarray, "h w"]:
-    """Decode a photo to a grey image, as its sensor delivered it.
-
-    EXIF orientation is ignored, as it is in recordings: K belongs to the sensor's raster.
-    """
+    """Decode a photo to grey in its sensor's raster, to which K belongs: EXIF is ignored."""
     import cv2
 
     encoded = np.frombuffer(data, dtype=np.uint8)
@@ -182,14 +169,7 @@ def find_board(name: str, photo: np.ndarray, board: Board) -> BoardView | None:
 
 
 def read_photos(paths: Sequence[Path], board: Board) -> Photos:
-    """Read photos and find the board in each, with a progress bar.
-
-    The board's print is the one with most corners; others are false detections.
-
-    Raises:
-        CorruptDataError: a file that cannot be decoded.
-        InvalidInputError: photos of different sizes.
-    """
+    """Find the board in photos of one size; raises CorruptDataError or InvalidInputError."""
     seen: list[BoardView] = []
     size: tuple[int, ...] = ()
     for path in progress(paths, "looking for the board", len(paths)):
@@ -222,11 +202,7 @@ def is_ambiguous(board: Board) -> bool:
 
 
 def check_unambiguous(board: Board, text: str) -> None:
-    """Refuse a board, described as `text`, whose pose is ambiguous.
-
-    Raises:
-        InvalidInputError: it looks the same after half a turn.
-    """
+    """Refuse a board, described as `text`, that looks the same turned; raises InvalidInputError."""
     if is_ambiguous(board):
         raise InvalidInputError(
             f"board {text!r} looks the same after half a turn; use one with an odd and an "
@@ -279,12 +255,9 @@ def _dark_first(photo: np.ndarray, pixels: np.ndarray, board: Chessboard) -> np.
 class Coverage:
     """Coverage of a camera by views of a board.
 
-    Attributes:
-        views_by_region: number of views with corners in each ninth of the image.
-        tilts_rad: [n, 2] angle of the board's normal to the viewing ray: right, down.
-        focal_sigma: standard deviation of the focal length that these views give, as a share of
-            it; infinity where they give none.
-        todo: advice, most important first; empty if the coverage is sufficient.
+    `views_by_region` are numbers of views in each ninth of the image, `tilts_rad` [n, 2] angles of
+    the board's normal to the viewing ray (right, down), `focal_sigma` the sigma of the focal length
+    as a share of it (infinity where there is none), `todo` advice, most important first.
     """
 
     views_by_region: Int64[np.ndarray, "3 3"]
@@ -296,13 +269,7 @@ class Coverage:
 def camera_coverage(
     views: Sequence[BoardView], size_px: tuple[int, int], lens: Lens | None = None
 ) -> Coverage:
-    """Coverage of the image by positions, tilts and sizes of the board, and what it gives.
-
-    Args:
-        views: views with a detected board.
-        size_px: width and height of the photos.
-        lens: lens of the camera; a default guess if unknown.
-    """
+    """Coverage of images of a size by the board, and what it gives; a lens of None is guessed."""
     lens = lens or Lens.guessed(*size_px)
     by_region, by_edge = np.zeros((3, 3), dtype=np.int64), np.zeros(4, dtype=np.int64)
     tilts_rad, sizes = np.zeros((len(views), 2)), np.zeros(len(views))

@@ -1,7 +1,4 @@
-"""Views of a board from photos or a running station, the intrinsics they give, and pictures.
-
-The pictures are SVG of all calibrations: coverage, residuals, rotations, maps of taxels.
-"""
+"""Views of a board from photos or a station, the intrinsics they give, and pictures (SVG)."""
 
 import argparse
 import time
@@ -36,6 +33,7 @@ from services.alignment.station_calibration.boards import (
     reprojection,
 )
 from services.alignment.station_calibration.record import (
+    Say,
     named_matrix,
     read_matrices,
     write_entry,
@@ -64,7 +62,6 @@ _STATE_COLOURS = dict(zip(STATES, _COLOURS, strict=True))
 
 Arrivals = Iterator[tuple[str, bytes]]
 Wait = Callable[[float], None]
-Say = Callable[[str], None]
 
 
 def calibrate_photos(options: argparse.Namespace, *, say: Say = print) -> dict[str, object]:
@@ -177,15 +174,11 @@ def read_lens(folder: Path, camera: str) -> tuple[Lens, tuple[int, int]]:
 class Session:
     """Growing set of views of one camera, with its coverage picture in the calibration folder.
 
-    Args:
-        options: of the command: board, calibration folder and camera.
-        live: folder in which images of a running station are kept, in new positions of a static
-            board; None for photos, which are kept already.
-        say: tells the operator something.
+    `live` is the folder in which images of a running station are kept, in new positions of a static
+    board; None for photos, which are kept already.
 
     Attributes:
-        views: kept so far.
-        coverage: of these views; None before the first.
+        coverage: of the views that are kept; None before the first.
         size_px: width and height of the newest image.
         todo: what to do next; empty if the coverage is sufficient.
         newest: board in the newest image; None if there is none.
@@ -235,7 +228,6 @@ class Session:
         self._keep(view)
 
     def _why_not(self, view: BoardView | None, photo: np.ndarray) -> str:
-        """Why a view is not kept; "" of one that is."""
         if self._live is None:
             return "no board" if view is None else "blurred, left out" * view.is_blurred
         if view is None:
@@ -248,7 +240,6 @@ class Session:
         return "" if is_new else "the board is where it was; hold it elsewhere"
 
     def _tell(self, name: str, why: str) -> None:
-        """Name a photo that is left out; of live images give a hint now and then."""
         self._num_idle += 1
         if self._live is None:
             self._say(f"{name}: {why}")
@@ -256,7 +247,6 @@ class Session:
             self._say(why)
 
     def _keep(self, view: BoardView) -> None:
-        """Add a view, redraw the picture and print advice."""
         self.views.append(view)
         self._num_idle = 0
         options = self._options
@@ -288,21 +278,23 @@ def folder_arrivals(folder: Path, *, wait: Wait = time.sleep) -> Arrivals:
 
 
 def station_arrivals(link: HttpLink, camera: str, *, wait: Wait = time.sleep) -> Arrivals:
-    """Yield new images of a station's camera at 5 Hz, indefinitely, skipping repeated ones.
-
-    `link` is connected to the station, `wait` sleeps between requests.
-    """
-    path, last = f"/v1/live/cameras/camera_{camera}", b""
+    """Yield new images of a station's camera at 5 Hz, indefinitely, skipping repeated ones."""
+    last = b""
     for number in count():
-        try:
-            data = link.request("GET", path, accept="image/jpeg").body
-        except StaleDataError:
-            # The camera pauses; an old image would look like a static board.
-            data = b""
+        data = live_image(link, camera)
         if data and data != last:
             last = data
             yield f"live image {number}", data
         wait(LIVE_PERIOD_S)
+
+
+def live_image(link: HttpLink, camera: str) -> bytes:
+    """The newest image (JPEG) of a camera; empty while it pauses, as an old one looks static."""
+    path = f"/v1/live/cameras/camera_{camera}"
+    try:
+        return link.request("GET", path, accept="image/jpeg").body
+    except StaleDataError:
+        return b""
 
 
 def coverage_picture(
@@ -418,7 +410,6 @@ def _advice(todo: Sequence[str]) -> list[str]:
 
 
 def _bars(values: np.ndarray, labels: Sequence[str], unit: str, width: Px) -> list[str]:
-    """Horizontal bars with label and value."""
     lengths = (width - 220) * values / max(float(np.max(values, initial=0.0)), 1e-12)
     parts = []
     for index, (value, label, length) in enumerate(zip(values, labels, lengths, strict=True)):
@@ -464,7 +455,6 @@ def _at(x: Px, y: Px, parts: Sequence[str]) -> str:
 
 
 def _page(width: Px, height: Px, title: str, parts: Sequence[str]) -> str:
-    """A complete SVG document."""
     paper = _tag("rect", width=width, height=height, fill="white")
     return _tag(
         "svg",

@@ -1,13 +1,10 @@
-"""Calibration of a glove: tare, gain and fault map of the taxels, from takes.
-
-Takes are named ones, or those that a running station records now.
-"""
+"""Calibration of a glove: tare, gain and fault map, from takes or what a station records now."""
 
 import argparse
 import csv
 import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from itertools import count
 from pathlib import Path
@@ -39,16 +36,15 @@ from services.alignment.calibration.tactile_tare import (
 from services.alignment.station_calibration.camera_views import glove_picture
 from services.alignment.station_calibration.record import (
     MATRICES_FILE,
+    Ask,
+    Question,
+    Say,
+    TakeRecorder,
+    ask_at_terminal,
     read_rows,
     read_stream,
     write_entry,
     write_picture,
-)
-from services.alignment.station_calibration.takes import (
-    Ask,
-    Question,
-    TakeRecorder,
-    ask_at_terminal,
 )
 
 STANDARD_GRAVITY_M_S2 = 9.80665
@@ -72,14 +68,9 @@ _PRESS = re.compile(
     r"|(?P<mass_kg>[0-9.]+) ?kg ?/ ?(?P<area_cm2>[0-9.]+) ?cm2)(?: +(?P<pads>[a-z+]+))?"
 )
 
-Say = Callable[[str], None]
-
 
 class PressRow(BaseModel):
-    """One row of the list of presses, by default of the whole take.
-
-    Instead of `pressure_kpa`, a weight may be given by `mass_kg` and `area_cm2`.
-    """
+    """A row of presses, by default of the whole take; a pressure, or mass_kg and area_cm2."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
@@ -105,11 +96,7 @@ class PressRow(BaseModel):
         return {n: v for n, v in given.items() if n not in weight} | {"pressure_kpa": pressure_kpa}
 
     def known_to(self, relative_sigma: float) -> "PressRow":
-        """The row with a sigma; without one of its own, a share of the pressure.
-
-        Raises:
-            InvalidInputError: a negative or infinite share.
-        """
+        """The row with a sigma, if none then a share, which must be 0 or more, of the pressure."""
         if not 0 <= relative_sigma < math.inf:
             raise InvalidInputError(
                 f"pressure sigma: got {relative_sigma:g}, expected a share of the pressure, 0 or "
@@ -195,16 +182,7 @@ def full_scale_counts(layout: TactileLayout, options: argparse.Namespace) -> flo
 
 
 class Guide:
-    """Leads an operator, who lays the glove down and presses it while a station records takes.
-
-    An invalid take is explained and repeated.
-
-    Args:
-        options: of the command.
-        recorder: records the takes.
-        ask: puts a question to the operator.
-        say: tells the operator something.
-    """
+    """Leads an operator through rest and presses; an invalid take is explained and repeated."""
 
     def __init__(
         self,
@@ -245,31 +223,30 @@ class Guide:
             f"Now two to four known pressures, the highest as high as work needs: {PRESS_HELP}."
         )
         known: list[tuple[PressRow, TaxelPress]] = []
-        while words := self._answer(NEXT).strip():
-            if words == "drop":
+        while answer := self._answer(NEXT).strip():
+            if answer == "drop":
                 known = known[:-1]
                 self.say(f"{len(known)} presses are left")
                 continue
             try:
-                wanted = parse_press(words, self._options.pressure_sigma)
+                typed = parse_press(answer, self._options.pressure_sigma)
             except (InvalidInputError, UnknownNameError) as error:
                 self.say(error.message)
                 continue
             try:
-                known.append(self._press(wanted, tare))
+                known.append(self._press(typed, tare))
             except InvalidInputError as error:
                 self.say(f"Not used: {error.message}")
                 continue
             self.say(self._known_so_far(tare, [press for _, press in known]))
         return [row for row, _ in known]
 
-    def _press(self, wanted: PressRow, tare: TaxelTare) -> tuple[PressRow, TaxelPress]:
-        """Record a press that determines a gain on its own."""
-        target = f"{wanted.pressure_kpa:.4g} kPa on {wanted.pads}"
+    def _press(self, pressure: PressRow, tare: TaxelTare) -> tuple[PressRow, TaxelPress]:
+        target = f"{pressure.pressure_kpa:.4g} kPa on {pressure.pads}"
         self._answer(Question(f"Put {target} and hold still.", f"Record {PRESS_S:g} s"))
 
         def check(take: str) -> tuple[PressRow, TaxelPress]:
-            row = wanted.model_copy(update={"take": take})
+            row = pressure.model_copy(update={"take": take})
             press = press_of(row, self._options)
             fit_gain(tare, [press], full_scale_counts=self._full_scale(tare))
             return row, press
@@ -305,11 +282,7 @@ class Guide:
 def record_takes(
     options: argparse.Namespace, guide: Guide | None = None
 ) -> tuple[str, list[PressRow]]:
-    """Lead an operator through rest and presses; returns the rest take and valid presses.
-
-    The list of presses is stored in the folder, so that the calibration can be repeated from the
-    same takes.
-    """
+    """Lead an operator through rest and presses; returns the rest take and the presses."""
     if guide is None:
         link = HttpLink(options.url, api_key=options.key)
         recorder = TakeRecorder(link.request, TASK, spool=options.spool, store=options.store)
@@ -328,11 +301,7 @@ def record_takes(
 def calibrate(
     options: argparse.Namespace, guide: Guide | None = None, *, say: Say = print
 ) -> dict[str, object]:
-    """Calibrate the tare of one glove, and with presses its gain and fault map.
-
-    Raises:
-        InvalidInputError: unsuitable takes or pressures; the message says what to do.
-    """
+    """Tare of a glove, with presses gain and fault map; raises InvalidInputError of bad takes."""
     side = options.side
     rest, rows = _takes(options, guide)
     tare = tare_of(rest, options)
@@ -362,7 +331,6 @@ def calibrate(
 
 
 def _takes(options: argparse.Namespace, guide: Guide | None) -> tuple[str, Sequence[PressRow]]:
-    """The rest take and the presses, either given or recorded now by a station."""
     if options.url is not None:
         if options.rest is not None or options.presses is not None:
             raise InvalidInputError(
@@ -379,7 +347,6 @@ def _takes(options: argparse.Namespace, guide: Guide | None) -> tuple[str, Seque
 
 
 def _tare_facts(tare: TaxelTare, say: Say) -> dict[str, object]:
-    """Print and return what a tare says."""
     level = tare.level
     median, sigma, noise = (
         float(np.median(counts))
@@ -399,7 +366,6 @@ def _tare_facts(tare: TaxelTare, say: Say) -> dict[str, object]:
 
 
 def _gain_facts(gain: TaxelGain, say: Say) -> dict[str, object]:
-    """Print and return what a gain says."""
     good = gain.state == OK
     median = float(np.median(gain.gain_counts_per_kpa[good]))
     ratio = float(np.median(gain.sigma_counts_per_kpa[good] / gain.gain_counts_per_kpa[good]))

@@ -14,19 +14,23 @@ from dextouch.frozen_model import FrozenModel
 from dextouch.schemas import Matrix
 from dextouch.serving import RequireScope
 from services.alignment.retargeting.hand_retargeter import profile_name
-from services.alignment.station_calibration.judgement import Finding, entry_of, judge
-from services.alignment.station_calibration.mount_session import num_kept_places
+from services.alignment.station_calibration.mount import num_kept_places
 from services.alignment.station_calibration.record import (
     DETAILS_FILE,
     MATRICES_FILE,
     TRACKERS,
+    Finding,
+    entry_of,
+    judge,
     read_matrices,
 )
-from services.alignment.station_calibration.run_status import Answer, RunRequest, RunStatus
 from services.alignment.station_calibration.runs import (
     EVERYTHING,
     SIDES,
+    Answer,
     CalibrationRuns,
+    RunRequest,
+    RunStatus,
     StationLocation,
 )
 
@@ -35,6 +39,7 @@ ItemState = Literal["good", "due", "missing", "optional", "simulated"]
 COMMAND: Final = "dextouch station calibrate"
 # Row of the delays of all trackers and cameras, before any of them is measured.
 PATH_DELAYS: Final = "path_delays"
+TURN_TOGETHER: Final = "Turn all trackers and cameras together for ten seconds."
 # Pattern of a name; title, next step and kind of guided run.
 KINDS: Final = (
     (
@@ -87,18 +92,8 @@ KINDS: Final = (
         "--take TAKE {to}",
         "",
     ),
-    (
-        r"([a-z0-9_]+)_latency_ns",
-        "Latency of {0}",
-        "Turn all trackers and cameras together for ten seconds.",
-        "time",
-    ),
-    (
-        PATH_DELAYS,
-        "Path delays",
-        "Turn all trackers and cameras together for ten seconds.",
-        "time",
-    ),
+    (r"([a-z0-9_]+)_latency_ns", "Latency of {0}", TURN_TOGETHER, "time"),
+    (PATH_DELAYS, "Path delays", TURN_TOGETHER, "time"),
 )
 # Fact of an entry that is its residual: how it is written, and what it tells.
 RESIDUALS: Final = {
@@ -148,8 +143,6 @@ def calibration_router(runs: CalibrationRuns) -> APIRouter:
 
 
 def _add_run(router: APIRouter, runs: CalibrationRuns) -> None:
-    """Routes of the run that is on."""
-
     @router.get("/run")
     async def get_calibration_run() -> RunStatus | None:
         """The run that is on, or the last one; null before the first."""
@@ -242,7 +235,8 @@ def overview(place: StationLocation) -> CalibrationOverview:
     known = {finding.name: finding for finding in judge(matrices)}
     details = _details(place.folder)
     wanted = _wanted(streams)
-    if not any(map(_is_path_delay, known)) and _can_turn(streams):
+    # Two trackers or more can be shaken together.
+    if not any(map(_is_path_delay, known)) and sum(name in TRACKERS for name in streams) > 1:
         wanted.append(PATH_DELAYS)
     names = [*wanted, *(name for name in known if name not in wanted)]
     items = [_item(name, known.get(name), details, place) for name in names]
@@ -263,11 +257,6 @@ def _is_path_delay(name: str) -> bool:
     return stream != name and (stream in TRACKERS or stream.startswith("camera_"))
 
 
-def _can_turn(streams: Sequence[str]) -> bool:
-    """Whether two trackers or more can be shaken together."""
-    return sum(name in TRACKERS for name in streams) > 1
-
-
 def _simulated(item: CalibrationItem, *, is_practised: bool) -> CalibrationItem:
     """Simulated devices need no calibration, and only those to practise with show a board."""
     changes: dict[str, object] = {"state": "simulated"} if item.state == "missing" else {}
@@ -282,7 +271,6 @@ def _simulated(item: CalibrationItem, *, is_practised: bool) -> CalibrationItem:
 
 
 def _wanted(streams: Sequence[str]) -> list[str]:
-    """Names of the calibrations that these streams need or gain by."""
     names = [] if any(name == "camera_head" for name in streams) else ["K_head"]
     for stream in streams:
         kind, _, subject = stream.partition("_")
@@ -294,11 +282,8 @@ def _wanted(streams: Sequence[str]) -> list[str]:
             names += [f"T_tracker_{tracker}_camera_{subject}"] if tracker else []
         elif kind == "keypoints":
             names.append(profile_name(subject))
-    return sorted(names, key=lambda name: ("tactile", "K_", "T_", "hand").index(_group(name)))
-
-
-def _group(name: str) -> str:
-    return next(group for group in ("tactile", "K_", "T_", "hand") if name.startswith(group))
+    groups = ("tactile", "K_", "T_", "hand")
+    return sorted(names, key=lambda name: [not name.startswith(group) for group in groups])
 
 
 def _item(
@@ -332,7 +317,6 @@ def _item(
 
 
 def _words(name: str, place: StationLocation) -> tuple[str, str, RunRequest | None]:
-    """Title, next step and guided run of a calibration."""
     for pattern, title, step, kind in KINDS:
         if matched := re.fullmatch(pattern, name):
             subject = matched[1] if matched.groups() else ""

@@ -4,7 +4,7 @@ import argparse
 import threading
 from collections.abc import Callable
 from contextlib import closing
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -13,11 +13,15 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 import structlog
+from pydantic import AwareDatetime, Field
 
 from dextouch.clients import HttpLink, Reply
 from dextouch.data_folder import practice_spool
 from dextouch.errors import ConflictError, DexTouchError, InvalidInputError, NotFoundError
+from dextouch.free_text import FreeText
+from dextouch.frozen_model import FrozenModel, example
 from dextouch.schemas import PracticeStatus, StationHealth
+from services.alignment.calibration.hand_eye import GaugeView
 from services.alignment.calibration.tactile_tare import FULL_SCALE_COUNTS
 from services.alignment.station_calibration import glove
 from services.alignment.station_calibration.boards import (
@@ -34,26 +38,13 @@ from services.alignment.station_calibration.camera_views import (
     station_arrivals,
 )
 from services.alignment.station_calibration.glove import Guide
-from services.alignment.station_calibration.mount import calibrate_mount
-from services.alignment.station_calibration.mount_session import (
+from services.alignment.station_calibration.mount import (
     POSES_FILE,
     MountSession,
+    calibrate_mount,
     station_sightings,
 )
-from services.alignment.station_calibration.record import TRACKERS
-from services.alignment.station_calibration.run_status import (
-    ENDED,
-    CameraRunView,
-    Choice,
-    Countdown,
-    GaugeView,
-    MountRunView,
-    Order,
-    Outline,
-    RunRequest,
-    RunStatus,
-)
-from services.alignment.station_calibration.takes import TICK_S, Question, TakeRecorder
+from services.alignment.station_calibration.record import TICK_S, TRACKERS, Question, TakeRecorder
 from services.alignment.station_calibration.times import measure_times
 
 logger = structlog.get_logger(__name__)
@@ -65,8 +56,7 @@ PRACTICE = "practice"
 TIME_TASK, SHAKE_S, LEAD_S = "calibrate-time", 10.0, 3.0
 SIDES, EVERYTHING = ("left", "right"), "all"
 
-# Below the address of a station, that of its practice devices.
-PRACTICE_PATH = "/practice"
+PRACTICE_PATH = "/practice"  # of practice devices, below the address of their station
 _NO_QUESTION: dict[str, object] = {
     "question": "",
     "action": "",
@@ -74,6 +64,119 @@ _NO_QUESTION: dict[str, object] = {
     "choices": (),
     "countdown": None,
 }
+Order = Literal["take", "drop"]
+RunState = Literal["running", "asking", "done", "failed", "cancelled"]
+ENDED: frozenset[RunState] = frozenset({"done", "failed", "cancelled"})
+Outline = tuple[tuple[float, float], ...]
+
+
+class RunRequest(FrozenModel):
+    """A guided run.
+
+    `camera` measures the lens of a camera with a board, `mount` where it sits on its tracker with a
+    fixed board, `glove` tare and gain of a glove, and `time` the path delays of `all` trackers and
+    cameras. `is_resumed` goes on with the places of a mount's run that was ended.
+    """
+
+    model_config = example(kind="glove", subject="left")
+
+    kind: Literal["camera", "mount", "glove", "time"]
+    subject: Literal["head", "wrist_left", "wrist_right", "left", "right", "all"]
+    board: FreeText = Field(default="", max_length=64)
+    is_resumed: bool = False
+
+
+class Answer(FrozenModel):
+    """What the operator answers to the question of a run."""
+
+    model_config = example(text="yes")
+
+    text: FreeText = Field(max_length=200)
+
+
+class ImageView(FrozenModel):
+    """The newest image of a camera and the board's corners in it, in its pixels.
+
+    `todo` is advice, most important first; `hint` says why the image was not kept.
+    """
+
+    image_index: int
+    width_px: int
+    height_px: int
+    corners_px: Outline = ()
+    todo: tuple[str, ...] = ()
+    hint: str = ""
+
+
+class CameraRunView(ImageView):
+    """Live view of a camera run.
+
+    `outlines_px` are those of the boards that were kept. `focal_sigma` is the standard deviation of
+    the focal length that the views give, as a share of it, None where they give none; the run goes
+    on until it is `focal_sigma_wanted`.
+    """
+
+    outlines_px: tuple[Outline, ...] = ()
+    views_by_region: tuple[tuple[int, ...], ...] = ()
+    num_views: int = 0
+    num_wanted: int
+    focal_sigma: float | None = None
+    focal_sigma_wanted: float
+
+
+class MountRunView(ImageView):
+    """Live view of a mount's run.
+
+    `places` are the kept ones in their order, True where they count: the solver leaves out those
+    that are far from the others. The run ends by itself when all `gauges` are full. `problem` is
+    why the solver refuses the places, `can_finish` says whether they determine the mount.
+    """
+
+    is_board_seen: bool
+    is_tracked: bool
+    is_still: bool
+    places: tuple[bool, ...]
+    gauges: tuple[GaugeView, ...]
+    problem: str = ""
+    can_finish: bool = False
+
+
+class Choice(FrozenModel):
+    """An answer to a question other than its action, and what it does."""
+
+    label: str
+    answer: str
+
+
+class Countdown(FrozenModel):
+    """What lasts for a known time, and how much of it is over."""
+
+    label: str
+    duration_s: float
+    elapsed_s: float = 0.0
+
+
+class RunStatus(FrozenModel):
+    """State of a guided run; `lines` is what it said, `question` what it waits for.
+
+    `action` is what an answer starts, such as "Record 10 s"; it is a text if `takes_text`, else
+    empty. `choices` are other answers. `facts` are the results as in `calibration_details.json`.
+    """
+
+    run_id: str
+    request: RunRequest
+    state: RunState
+    started_at: AwareDatetime
+    question: str = ""
+    action: str = ""
+    takes_text: bool = False
+    choices: tuple[Choice, ...] = ()
+    lines: tuple[str, ...] = ()
+    countdown: Countdown | None = None
+    camera: CameraRunView | None = None
+    mount: MountRunView | None = None
+    facts: dict[str, object] = Field(default_factory=dict)
+    problem: str = ""
 
 
 class _CancelledError(Exception):
@@ -82,10 +185,7 @@ class _CancelledError(Exception):
 
 @dataclass(frozen=True)
 class StationLocation:
-    """Where the station answers, where its takes are, and the folder of its calibration.
-
-    `practice` is the state of its practice devices.
-    """
+    """Where a station and its practice devices answer, folders of takes and calibration."""
 
     url: str | None
     key: str | None
@@ -95,11 +195,7 @@ class StationLocation:
     practice: Literal["unavailable", "off", "on"] = "unavailable"
 
     def link(self) -> HttpLink:
-        """A connection to the station.
-
-        Raises:
-            InvalidInputError: no station is set.
-        """
+        """A connection to the station; raises InvalidInputError: no station is set."""
         if self.url is None:
             raise InvalidInputError(
                 "calibration: no station_url is set; start the alignment service with "
@@ -108,11 +204,7 @@ class StationLocation:
         return HttpLink(self.url, api_key=self.key)
 
     def visited(self) -> "VisitedStation":
-        """The place with the folder of its devices, and the station's streams.
-
-        Simulated devices have the folder `practice`, so that nobody records with their calibration.
-        While practice devices run, the place is theirs.
-        """
+        """The place (of practice devices while they are on), and the station's streams."""
         with closing(self.link()) as link:
             reply = link.request("GET", "/v1/practice")
             practice = PracticeStatus.model_validate_json(reply.body, extra="ignore").state
@@ -133,11 +225,7 @@ class StationLocation:
         return self.folder / "photos" / f"mount-{camera}"
 
     def switch_practice(self, *, is_on: bool) -> None:
-        """Start or stop the practice devices of the station.
-
-        Raises:
-            ConflictError: the station has real devices.
-        """
+        """Start or stop practice devices; raises ConflictError: the station has real ones."""
         with closing(self.link()) as link:
             link.request("POST", f"/v1/practice/{'start' if is_on else 'stop'}")
 
@@ -151,12 +239,7 @@ class VisitedStation(NamedTuple):
 
 
 class GuidedRun:
-    """One run, which another thread watches, answers and ends.
-
-    Args:
-        request: what is calibrated.
-        station: where.
-    """
+    """One run, which another thread watches, answers and ends."""
 
     def __init__(self, request: RunRequest, station: VisitedStation) -> None:
         self._place, self._streams, _ = station
@@ -190,32 +273,23 @@ class GuidedRun:
         return self._status
 
     def answer(self, text: str) -> RunStatus:
-        """Answer the question of the run.
-
-        Raises:
-            ConflictError: it asks nothing.
-            InvalidInputError: a text that is none of the answers to this question.
-        """
+        """Answer the question of the run; raises ConflictError without, or InvalidInputError."""
         with self._lock:
-            asked = self._status
-            if asked.state != "asking":
-                raise ConflictError(f"calibration run: {asked.state}, it asks nothing")
-            known = ("", *(choice.answer for choice in asked.choices))
-            if not asked.takes_text and text not in known:
+            status = self._status
+            if status.state != "asking":
+                raise ConflictError(f"calibration run: {status.state}, it asks nothing")
+            known = ("", *(choice.answer for choice in status.choices))
+            if not status.takes_text and text not in known:
                 raise InvalidInputError(
                     f"calibration run: got the answer {text!r}, expected one of {list(known)}; an "
-                    f"empty one starts {asked.action!r}"
+                    f"empty one starts {status.action!r}"
                 )
             self._set(state="running", **_NO_QUESTION)
             self._answers.put(text)
         return self._status
 
     def order(self, order: Order) -> RunStatus:
-        """Keep the present place of a mount's run as soon as it is still, or drop the last one.
-
-        Raises:
-            ConflictError: the run is of another kind, or not on.
-        """
+        """Keep the place of a mount once it is still, or drop one; raises ConflictError."""
         if self._request.kind != "mount" or self._status.state != "running":
             raise ConflictError(
                 f"calibration run: {self._status.state}, it keeps no places that could be "
@@ -230,10 +304,7 @@ class GuidedRun:
         return self._status
 
     def cancel(self) -> RunStatus:
-        """End the run without a result.
-
-        A take that is being recorded is discarded; the places of a mount are kept.
-        """
+        """End the run without a result; a take is discarded, places of a mount are kept."""
         self._is_cancelled.set()
         self._answers.put(None)
         self._thread.join()
@@ -343,7 +414,6 @@ class GuidedRun:
                 )
 
     def _shake(self, name: str) -> str:
-        """Record a take in which everything is shaken, and return it."""
         self._count_down("Take everything in hand; recording begins in", LEAD_S)
         for _ in range(round(LEAD_S / TICK_S)):
             self._wait(TICK_S)
@@ -441,7 +511,7 @@ def _mount_view(index: int, session: MountSession) -> MountRunView:
         is_tracked=session.is_tracked,
         is_still=session.is_still,
         places=tuple(place not in left_out for place in range(session.num_kept)),
-        gauges=tuple(GaugeView(**asdict(gauge)) for gauge in progress.gauges),
+        gauges=progress.gauges,
         problem=progress.problem,
         can_finish=progress.result is not None,
     )
@@ -466,12 +536,7 @@ class CalibrationRuns:
         self._lock = threading.Lock()
 
     def start(self, request: RunRequest) -> RunStatus:
-        """Begin a run.
-
-        Raises:
-            ConflictError: another one is not done.
-            InvalidInputError: no such board, subject or station.
-        """
+        """Begin a run; raises ConflictError while one is on, InvalidInputError for its subject."""
         subjects = {"glove": SIDES, "time": (EVERYTHING,)}.get(request.kind, tuple(TRACKERS))
         if request.subject not in subjects:
             raise InvalidInputError(
@@ -494,11 +559,7 @@ class CalibrationRuns:
             return self._run.status
 
     def switch_practice(self, *, is_on: bool) -> None:
-        """Start or stop the practice devices of the station.
-
-        Raises:
-            ConflictError: a run is on, or the station has real devices.
-        """
+        """Start or stop practice devices; raises ConflictError at real ones, or in a run."""
         with self._lock:
             if self._run is not None and self._run.status.state not in ENDED:
                 raise ConflictError(
@@ -512,11 +573,7 @@ class CalibrationRuns:
         return None if self._run is None else self._run.status
 
     def present(self) -> GuidedRun:
-        """The run that is on, or the last one.
-
-        Raises:
-            NotFoundError: none was begun.
-        """
+        """The run that is on, or the last one; raises NotFoundError: none was begun."""
         if self._run is None:
             raise NotFoundError("calibration run: none was begun; start one first")
         return self._run

@@ -1,7 +1,4 @@
-"""Synchronization of streams with clocks of their own to one reference clock and one grid.
-
-Here: how far an alignment is, as the share of the work done, the current stage and stream.
-"""
+"""Synchronization of streams with clocks of their own to one reference clock and one grid."""
 
 from collections.abc import Callable
 from typing import Literal, NamedTuple

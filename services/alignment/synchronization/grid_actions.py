@@ -14,8 +14,7 @@ from dextouch.schemas import Domain, Matrix
 from dextouch.tactile.layout import FINGERS, SIDES, Side
 from services.alignment.retargeting import HandRetargeter, RetargetResult, RetargetStatus
 from services.alignment.retargeting.hand_retargeter import calibrated_profile
-from services.alignment.retargeting.wrist_frame import hand_axes_check
-from services.alignment.retargeting.wrist_transfer import NUM_PADS, transfer_by_touch
+from services.alignment.retargeting.wrist import NUM_PADS, hand_axes_check, transfer_by_touch
 from services.alignment.settings import WristChoice
 from services.alignment.synchronization.recorded_streams import LoadedStream
 from services.alignment.synchronization.resampling import (
@@ -45,11 +44,7 @@ REST_RAD_S = 0.1
 
 @dataclass(frozen=True)
 class GriddedStreams:
-    """Streams that actions are computed from, and the placement of the grid among their samples.
-
-    The values of `TOUCH_STREAMS`, if there are any, are the forces (N) of the hand's pads. Steps
-    need not have touch.
-    """
+    """Streams of which actions are made, `TOUCH_STREAMS` as forces (N) of pads, and their grid."""
 
     grid_ns: Int64[np.ndarray, " n"]
     streams: Mapping[str, LoadedStream]
@@ -76,8 +71,7 @@ class GriddedStreams:
 class GridActions:
     """Actions on the grid; `commanded` is None where nothing was commanded.
 
-    `absent` are the parts of actions that no step has, and `unseen_fingers` says by side at which
-    steps a finger was in a gap of its own.
+    `absent` parts have no step, `unseen_fingers` are steps at which a finger was in a gap.
     """
 
     anchor: AnchorPoses
@@ -98,10 +92,7 @@ class RetargetedHand:
 
 
 def commanded_streams(names: Collection[str]) -> tuple[str, ...]:
-    """The streams that commanded actions are made of, among those of a recording; () if none are.
-
-    Joints, and each wrist that is tracked or commanded.
-    """
+    """Streams of commanded actions: joints, and wrists tracked or commanded; () if none are."""
     wrists = [f"wrist_{side}" for side in SIDES]
     wrists = [f"{one}_commanded" for one in wrists if {one, f"{one}_commanded"} & set(names)]
     needed = ("joints_commanded", *wrists)
@@ -132,15 +123,9 @@ def make_actions(
 ) -> GridActions:
     """Measured and, where recorded, commanded actions, all relative to the measured first step.
 
-    Human hands are retargeted, a robot's joints taken as they are. Parts that were not recorded
-    have the identity as their pose, and joints at rest.
-
-    Args:
-        gridded: placed streams.
-        domain: whose hands act.
-        calibration: of the recording.
-        wrist: where the robot's wrists are that stand for human ones.
-        max_gap_ns: longest time without a finger that is no gap of it; of slow streams longer.
+    Human hands are retargeted. Parts that were not recorded have the identity as their pose, and
+    joints at rest. `wrist` says where the robot's wrists are that stand for human ones; a finger
+    may be missing for `max_gap_ns` (of slow streams longer).
     """
     left, right, head = (gridded.poses(name) for name in POSE_STREAMS)
     absent = [name for name in ACTION_STREAMS[domain] if name not in gridded.streams]
@@ -221,15 +206,9 @@ def retarget_hands(
 ) -> dict[Side, RetargetedHand]:
     """Joint angles of the recorded hands on the grid, each from a thread of its own.
 
-    Every sample is retargeted once, at the rate at which the hand was tracked; the grid's steps
-    take the line between their two neighbours, which `gridded.at` has found to be in no gap.
-
-    The placement is valid at every step. `hand_profile_SIDE` of the calibration is the person's
-    hand, which is measured from the recording itself where it is absent.
-
-    Raises:
-        InvalidInputError: keypoints that are not a hand, of the other side or in other axes, see
-            `hand_axes_check` and `HandRetargeter.retarget`.
+    Samples are retargeted at the tracker's rate, steps interpolated. The person's hand is
+    `hand_profile_SIDE` of the calibration, else measured from the recording. Raises
+    InvalidInputError: no such hand, or other axes (`hand_axes_check`, `HandRetargeter.retarget`).
     """
     recorded: list[Side] = [side for side in SIDES if f"keypoints_{side}" in gridded.streams]
     hands = {side: HandRetargeter(side, calibrated_profile(calibration, side)) for side in recorded}
@@ -293,10 +272,7 @@ def status_on_grid(status: np.ndarray, at: GridPlacement) -> UInt8[np.ndarray, "
 def motion_figures(
     trajectory: HandTrajectory, *, rate_hz: float, sides: Sequence[Side] = SIDES
 ) -> Mapping[str, float]:
-    """Peak speed and jerk of each wrist, and the share of steps in which these hands are at rest.
-
-    The jerk is the 95th percentile of third differences, which a few outliers do not decide.
-    """
+    """Peak speed and jerk (95th percentile) of each wrist, and the share of steps at rest."""
     figures: dict[str, float] = {}
     moves = np.zeros(max(len(trajectory.joints_left_rad) - 1, 0), dtype=bool)
     for side in sides:

@@ -1,10 +1,4 @@
-"""Streams of a recording on the host's clock, converted to the units of episodes, and cut to one.
-
-Stamps are read whole, values only where they are asked for, in pieces: an hour of images or
-pressures is never in memory at once. Images of `jpeg` and `h264` streams go over as the bytes that
-they are: nothing is decoded but for markers on objects, whose poses become streams too. An object
-has samples only where it was seen, so that gaps show where it was not.
-"""
+"""Streams of a recording on the host's clock, converted piece by piece, and cut to one episode."""
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
@@ -17,7 +11,13 @@ from jaxtyping import Bool, Float64, Int64, Shaped
 
 from dextouch.episodes import GOP_IMAGES, RecordingReader
 from dextouch.errors import InvalidInputError
-from dextouch.geometry import distortion_of, pose_from_transform, transform, transform_from_pose
+from dextouch.geometry import (
+    NUM_DISTORTION,
+    distortion_of,
+    pose_from_transform,
+    transform,
+    transform_from_pose,
+)
 from dextouch.geometry.rotations import rotation_angle
 from dextouch.schemas import Matrix, SceneObject, SceneObjects, matrix_rows
 from dextouch.streams import (
@@ -27,11 +27,16 @@ from dextouch.streams import (
     MOUNTS,
     Implausible,
     StreamDescriptor,
+    check_camera_matrix,
     encoded_values,
 )
-from services.alignment.calibration.tactile_tare import REASONS, TactileCalibration
-from services.alignment.calibration.taxel_faults import taxel_faults, unusable_taxels
-from services.alignment.retargeting.wrist_frame import (
+from services.alignment.calibration.tactile_tare import (
+    REASONS,
+    TactileCalibration,
+    taxel_faults,
+    unusable_taxels,
+)
+from services.alignment.retargeting.wrist import (
     calibrated_transform,
     calibration_name,
     to_wrist_axes,
@@ -83,11 +88,9 @@ class LoadedStream:
 
 @dataclass(frozen=True)
 class DatedStream:
-    """One stream on the host's clock, whose values are read on demand.
+    """One stream on the host's clock, as in the episode, whose values are read on demand.
 
-    `descriptor` is that of the episode; `quality` are figures for the record, and `calibration`
-    matrices that the episode carries beside those of the recording. `unseen` are keypoints that are
-    not to be believed, which become NaN, and `implausible` samples that were found on the way.
+    Keypoints that are `unseen` become NaN, `implausible` samples were found on the way.
     """
 
     recording: RecordingReader
@@ -127,10 +130,7 @@ class DatedStream:
             yield Block(t_ns[low : low + rows], values)
 
     def load(self, of: Conversion = np.asarray) -> LoadedStream:
-        """All samples at once, or a function `of` them: for the streams that actions are made of.
-
-        The descriptor remains that of the samples.
-        """
+        """All samples, or a function `of` them, at once; the descriptor remains that of samples."""
         pieces = [of(piece.values) for piece in self.pieces()]
         empty = np.empty((0, *self.descriptor.shape), dtype=self.descriptor.numpy_dtype())
         values = np.concatenate(pieces) if pieces else of(empty)
@@ -139,10 +139,7 @@ class DatedStream:
 
 @dataclass
 class EpisodeStream:
-    """One stream of an episode, whose samples are produced while they are written.
-
-    `blocks` are in order, with times of the episode; `quality` is complete when all were taken.
-    """
+    """A stream of an episode, produced while it is written; then `quality` is complete."""
 
     descriptor: StreamDescriptor
     blocks: Iterator[Block]
@@ -152,10 +149,7 @@ class EpisodeStream:
 def date_stream(recording: RecordingReader, name: str) -> DatedStream:
     """Fit the clock of one stream and choose the conversion of its values.
 
-    Raises:
-        ClockFitError: its stamps fit no clock.
-        InvalidInputError: calibration is missing or of the wrong shape.
-        UnknownNameError: the recording has no such stream.
+    Raises ClockFitError; InvalidInputError: a wrong calibration; UnknownNameError: no stream.
     """
     descriptor, calibration = recording.streams[name], recording.attributes.calibration
     timing = time_stream(
@@ -191,11 +185,7 @@ def date_stream(recording: RecordingReader, name: str) -> DatedStream:
 
 
 def cut_stream(stream: DatedStream, origin_ns: int, last_ns: int) -> EpisodeStream:
-    """The samples of the episode's time, with the neighbours that its ends need.
-
-    `origin_ns` is the host time of the episode's time 0; `last_ns`, of the last step, counts from
-    there.
-    """
+    """Samples from host time `origin_ns` on for `last_ns`, with the neighbours of the ends."""
     margin_ns = round(EDGE_PERIODS * stream.descriptor.period_ns())
     edges_ns = [origin_ns - margin_ns, origin_ns + last_ns + margin_ns]
     first = int(np.searchsorted(stream.t_ns, edges_ns[0], side="left"))
@@ -207,6 +197,29 @@ def cut_stream(stream: DatedStream, origin_ns: int, last_ns: int) -> EpisodeStre
         source = _image_blocks(stream, first, stop, quality)
     blocks = (Block(block.t_ns - origin_ns, block.values) for block in source)
     return EpisodeStream(stream.descriptor, blocks, quality)
+
+
+def check_lens(stream: StreamDescriptor, calibration: Mapping[str, Matrix], *, where: str) -> None:
+    """Refuse matrices that are no camera's, or were measured on images of another size."""
+    camera = stream.name.removeprefix("camera_")
+    if stream.kind != "image" or camera == stream.name:
+        return
+    shapes = {f"K_{camera}": (3, 3), f"distortion_{camera}": (1, NUM_DISTORTION)}
+    for name, shape in (shapes | {f"image_size_{camera}_px": (1, 2)}).items():
+        found = np.shape(calibration[name]) if name in calibration else shape
+        if found != shape:
+            raise InvalidInputError(f"{where}: calibration {name!r} is {found}, expected {shape}")
+    height_px, width_px = stream.shape[:2]
+    size_px = calibration.get(f"image_size_{camera}_px", ((width_px, height_px),))[0]
+    if tuple(size_px) != (width_px, height_px):
+        raise InvalidInputError(
+            f"{where}: K_{camera} was measured on images of {size_px[0]:g} by {size_px[1]:g} px, "
+            f"but {stream.name!r} holds {width_px} by {height_px}; calibrate the camera in the "
+            "mode that is recorded"
+        )
+    if f"K_{camera}" in calibration:
+        K = np.array(calibration[f"K_{camera}"])
+        check_camera_matrix(K, (width_px, height_px), where=f"{where}: K_{camera}")
 
 
 def _nanoseconds(calibration: dict[str, Matrix], name: str) -> float | None:
@@ -335,11 +348,7 @@ def with_tracked_objects(
     objects: SceneObjects | None,
     calibration: Mapping[str, Matrix],
 ) -> dict[str, DatedStream]:
-    """The streams, those of trackers on objects moved to the objects.
-
-    Raises:
-        InvalidInputError: a stream that is needed is missing, or an object has two sources.
-    """
+    """The streams, those of trackers on objects moved to these; raises InvalidInputError."""
     changed = dict(streams)
     for one in _listed(objects):
         stream = streams.get(one.stream)
@@ -379,16 +388,7 @@ def marker_streams(
     max_gap_ns: int,
     on_progress: OnProgress = lambda _: None,
 ) -> list[EpisodeStream]:
-    """Poses of the objects that have markers; objects that were never seen are omitted.
-
-    Args:
-        recording: its calibration has K_head and, of a lens with distortion, distortion_head.
-        streams: of the recording, by name.
-        objects: of the recording's task.
-        inside_ns: host times of the first and the last step of the episode.
-        max_gap_ns: longest gap between poses of the camera.
-        on_progress: called as images are searched.
-    """
+    """Poses of the objects with markers that the head camera saw between two host times."""
     listed = [one for one in _listed(objects) if one.markers]
     if objects is None or not listed:
         return []
@@ -399,24 +399,24 @@ def marker_streams(
     calibration = recording.attributes.calibration
     K = np.array(calibration["K_head"])
     tracker = MarkerTracker(listed, objects.dictionary, K, distortion_of(calibration, "head"))
-    wanted = np.flatnonzero(
+    selected = np.flatnonzero(
         (camera.t_ns >= inside_ns[0] - period_ns) & (camera.t_ns <= inside_ns[1] + period_ns)
     )
-    places, Ts = _camera_poses(streams["head"], camera.t_ns, wanted, max_gap_ns)
+    places, Ts = _camera_poses(streams["head"], camera.t_ns, selected, max_gap_ns)
     for low in range(0, len(places), _DECODED_AT_ONCE):
         part = places[low : low + _DECODED_AT_ONCE]
         kept = camera.timing.kept[part]
         damaged = recording.damaged_images(HEAD_CAMERA, kept)
         whole = np.isin(kept, damaged, invert=True)
         images = recording.images_at(HEAD_CAMERA, kept[whole])
-        here = Ts[low : low + _DECODED_AT_ONCE][whole]
-        for t_ns, image, T in zip(camera.t_ns[part[whole]].tolist(), images, here, strict=True):
+        poses = Ts[low : low + _DECODED_AT_ONCE][whole]
+        for t_ns, image, T in zip(camera.t_ns[part[whole]].tolist(), images, poses, strict=True):
             tracker.add(t_ns - inside_ns[0], image, T)
         on_progress(progress_within("objects", low / len(places), HEAD_CAMERA))
     tracked = tracker.tracked()
     rate_hz = camera.descriptor.nominal_rate_hz
     return [
-        _stream(one, tracked[one.name], rate_hz, camera.t_ns[wanted] - inside_ns[0])
+        _stream(one, tracked[one.name], rate_hz, camera.t_ns[selected] - inside_ns[0])
         for one in listed
         if len(tracked[one.name].t_ns)
     ]
@@ -427,22 +427,21 @@ def _listed(objects: SceneObjects | None) -> tuple[SceneObject, ...]:
 
 
 def _camera_poses(
-    head: DatedStream, image_ns: np.ndarray, wanted: np.ndarray, max_gap_ns: int
+    head: DatedStream, image_ns: np.ndarray, selected: np.ndarray, max_gap_ns: int
 ) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, "n 4 4"]]:
-    """Those of the wanted images at which the camera's pose is known, and the poses."""
     loaded = head.load()
     finite = np.isfinite(loaded.values).all(axis=1)
     period_ns = head.descriptor.period_ns()
     at = place_on_grid(
         loaded.t_ns[finite],
-        image_ns[wanted],
+        image_ns[selected],
         period_ns=period_ns,
         max_gap_ns=stream_gap_ns(max_gap_ns, period_ns),
     )
     if not at.valid.any():
         return np.zeros(0, dtype=np.int64), np.zeros((0, 4, 4))
     Ts = poses_on_grid(loaded.values[finite], at)
-    return wanted[at.valid], Ts[at.valid]
+    return selected[at.valid], Ts[at.valid]
 
 
 def _stream(

@@ -1,8 +1,6 @@
 """Resampling of vectors and poses to a common time grid, never across a gap, and what that refuses.
 
-An episode carries the parts of its recording that are not in it as matrices beside its calibration,
-one a reason and stream: `refused_<reason>_<stream>_s`, rows of start and stop in seconds after the
-recording's start.
+Episodes carry what is left out as `refused_<reason>_<stream>_s`: rows of start and stop (s).
 """
 
 import re
@@ -35,11 +33,7 @@ NS_PER_S = 1e9
 
 @dataclass(frozen=True)
 class GridPlacement:
-    """Neighbouring samples and weights of each grid step in one stream.
-
-    `weight` of the right neighbour lies in [0, 1] inside the samples; within `EDGE_PERIODS`
-    of the ends it may lie outside (the line through the last two samples goes on).
-    """
+    """Left neighbour and weight of the right one of grid steps; beyond 0 … 1 near the ends."""
 
     left: Int64[np.ndarray, " n"]
     weight: Float64[np.ndarray, " n"]
@@ -59,11 +53,7 @@ def stream_gap_ns(max_gap_ns: int, period_ns: int) -> int:
 def place_on_grid(
     t_ns: np.ndarray, grid_ns: np.ndarray, *, period_ns: int, max_gap_ns: int
 ) -> GridPlacement:
-    """Neighbours and weights of grid times among samples of a nominal period.
-
-    Sample times are strictly increasing; fewer than two make every step invalid. Two that are
-    further apart than `max_gap_ns` are not connected.
-    """
+    """Neighbours and weights of grid times; invalid across `max_gap_ns`, or of one sample."""
     t_ns, grid_ns = np.asarray(t_ns, dtype=np.int64), np.asarray(grid_ns, dtype=np.int64)
     if t_ns.size < 2:
         nowhere = np.zeros(grid_ns.size, dtype=np.int64)
@@ -121,10 +111,9 @@ def bridged_run(valid: np.ndarray, *, max_steps: int) -> tuple[int, int]:
 
 
 class RefusedPart(FrozenModel):
-    """A stretch of the recording that is not in the episode.
+    """A stretch of the recording that is not in the episode, in seconds after its start.
 
-    `start_s` and `stop_s` count from the recording's start; `stream` is the one to blame, None
-    where none is.
+    `stream` is the one to blame, None where none is.
     """
 
     start_s: FiniteFloat
@@ -136,10 +125,7 @@ class RefusedPart(FrozenModel):
 def refused_edges(
     first_ns: Mapping[str, int], last_ns: Mapping[str, int], start_ns: int
 ) -> list[RefusedPart]:
-    """Ends of a recording, started at `start_ns`, that not all streams cover.
-
-    `first_ns` and `last_ns` are of the samples of each stream that actions are made of.
-    """
+    """Ends of a recording, which began at `start_ns`, that not all of these streams cover."""
     latest = max(first_ns, key=lambda name: first_ns[name])
     earliest = min(last_ns, key=lambda name: last_ns[name])
     return [
@@ -153,8 +139,8 @@ def refused_stretches(
 ) -> list[RefusedPart]:
     """Steps of the grid that are not in the episode, which has the steps `taken`: first, stop.
 
-    `t_ns` are times of at least two steps on the clock of `start_ns`, the recording's start;
-    `valid` says of each stream whether it can be read at each step.
+    `t_ns` are two times or more on the clock of the recording's start, `start_ns`; `valid` says of
+    each stream whether it can be read at each step.
     """
     step_ns = int(t_ns[1] - t_ns[0])
 
@@ -172,10 +158,7 @@ def refused_stretches(
 
 
 def interpolated_matrices(t_ns: np.ndarray, valid: Mapping[str, np.ndarray]) -> dict[str, Matrix]:
-    """When each stream was missing at steps of the episode, as it carries that.
-
-    `t_ns` are times of the steps on the episode's clock; rows are start and stop in seconds.
-    """
+    """Start and stop (s) of the steps at which each stream was missing, as matrices."""
     rows = {name: _rows_s(t_ns, ~mine) for name, mine in valid.items()}
     return {
         f"interpolated_{name}_s": matrix_rows(np.array(runs)) for name, runs in rows.items() if runs
@@ -185,11 +168,7 @@ def interpolated_matrices(t_ns: np.ndarray, valid: Mapping[str, np.ndarray]) -> 
 def interpolated_fingers(
     t_ns: np.ndarray, unseen: Mapping[Side, Bool[np.ndarray, "n 5"]]
 ) -> dict[str, Matrix]:
-    """When each finger was missing at steps of the episode, as it carries that.
-
-    Rows are start and stop in seconds on the episode's clock, and the finger. Fingers that no step
-    has are absent parts of the episode instead.
-    """
+    """Start, stop (s) and number of fingers that are missing at some, but not all steps."""
     found = {}
     for side, of_hand in unseen.items():
         rows = [
@@ -203,7 +182,6 @@ def interpolated_fingers(
 
 
 def _rows_s(t_ns: np.ndarray, steps: np.ndarray) -> list[tuple[float, float]]:
-    """Start and stop of each stretch of these steps, in seconds."""
     step_ns = int(t_ns[1] - t_ns[0]) if len(t_ns) > 1 else 0
     return [
         (t_ns[start] / NS_PER_S, (t_ns[stop - 1] + step_ns) / NS_PER_S)
@@ -216,10 +194,7 @@ def with_causes(
     left_out_ns: Mapping[str, Iterable[tuple[int, int, RefusedReason]]],
     start_ns: int,
 ) -> list[RefusedPart]:
-    """The refused parts with those of each stream that cannot be true, in place of its gaps there.
-
-    `left_out_ns` are on the clock of `start_ns`, the recording's start.
-    """
+    """The refused parts, with those of samples that cannot be true in place of their gaps."""
     causes = [
         _part(begin_ns, end_ns, start_ns, reason, name)
         for name, mine in left_out_ns.items()

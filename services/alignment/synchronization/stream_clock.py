@@ -48,10 +48,7 @@ MIN_CUT_SHARE = 0.01
 
 @dataclass(frozen=True)
 class TimedStream:
-    """Strictly increasing times on the host's clock, with the report of the clock fit.
-
-    `kept` are indices of the samples that have a time of their own; duplicates are dropped.
-    """
+    """Increasing times of samples `kept` (not repeated) on the host's clock, and their report."""
 
     kept: Int64[np.ndarray, " n"]
     t_host_ns: Int64[np.ndarray, " n"]
@@ -81,16 +78,11 @@ def time_stream(
 ) -> TimedStream:
     """Fit the device's clock and compute the time of every sample.
 
-    The device's stamps are used where there are any (unless samples are numbered and the stamps, by
-    what is declared or by what they show, are coarser than a quarter of the period), else its
-    sequence numbers times the nominal period, else the count of samples that a steady device must
-    have sent, else the arrivals as they are.
-
-    The calibrated constant path delay `latency_ns` is taken away from all times; its sigma is None
-    if it was not measured.
-
-    Raises:
-        ClockFitError: too few samples, or stamps that no clock gives; names the stream.
+    The device's stamps are used where there are any (unless samples are numbered and the stamps are
+    declared or shown to be coarser than a quarter of the period), else its sequence numbers times
+    the period, else the count of samples that a steady device must have sent, else the arrivals.
+    The calibrated path delay `latency_ns` is taken away; its sigma is None if it was not measured.
+    Raises ClockFitError: too few samples, or stamps that no clock gives; names the stream.
     """
     try:
         dated = _dated(batch, descriptor)
@@ -118,7 +110,6 @@ def time_stream(
 
 
 def _warnings(dated: _Dated, period_ns: int) -> tuple[ClockWarning, ...]:
-    """Reasons why the times may be wrong, if any."""
     skew_limit_ppm, lateness_limit_ns = MAX_RATE_ERROR_PPM, max(period_ns, MIN_LATENESS_NS)
     if dated.method == "device":
         skew_limit_ppm, lateness_limit_ns = MAX_SKEW_PPM, MAX_STAMPED_LATENESS_NS
@@ -165,11 +156,7 @@ def _dated(batch: SampleBatch, descriptor: StreamDescriptor) -> _Dated:
 def _keeps_unit(
     device_ns: np.ndarray, t_host_ns: np.ndarray, period_ns: int, *, may_change: bool
 ) -> bool:
-    """Refuse stamps of another unit, by blocks of samples: the clock may step between them.
-
-    Returns:
-        False where the unit is another one for a part of the time, and `may_change`.
-    """
+    """Refuse stamps of another unit; False where only a part has one, and `may_change`."""
     edges = np.arange(0, len(device_ns), MIN_COUNTED_SAMPLES)
     if len(edges) < 2:
         return True

@@ -1,16 +1,82 @@
 // The calibration page: what is due, and guided runs with live coverage of the board.
 
-import {
-  ageWords, capital, countWords, delayRows, isOfCamera, LEVELS, nextWords, placesWords, polygon, progressOf, runLevel, runTitle, secondsLeft, signsOf,
-} from "./calibration_words.js";
-import * as api from "./catalog/api.js";
-import { element, find, levelBadge, setText, showChildren, why } from "./dom.js";
-import { keep, kept } from "./kept.js";
-import { ask } from "./session.js";
+import { attempt, button, cell, element, find, isModified, keep, kept, levelBadge, onClick, onSubmit, say, setText, shape, showChildren, table, why } from "./dom.js";
+import * as api from "./requests.js";
+
+const LEVELS = { good: "OK", due: "WARN", missing: "ERROR", optional: "STALE", simulated: "STALE" };
+const RUN_LEVELS = { running: "WARN", asking: "WARN", done: "OK", failed: "ERROR", cancelled: "STALE" };
+
+function ageWords(days) {
+  if (days === null || days === undefined) return "";
+  if (days < 1 / 24) return `${Math.max(0, Math.round(days * 1440))} min`;
+  return days < 2 ? `${Math.round(days * 24)} h` : `${Math.round(days)} days`;
+}
+
+function runTitle({ kind, subject }) {
+  const camera = `${subject.replaceAll("_", " ")} camera`;
+  return { camera: `Lens of the ${camera}`, mount: `Mount of the ${camera}`, glove: `Glove ${subject}`, time: "Path delays" }[kind];
+}
+
+// What the operator has to do now, in one sentence.
+function nextWords(run, isPractised) {
+  if (run.state === "asking") return run.question;
+  if (run.state === "failed") return capital(run.problem);
+  if (run.state === "cancelled") return cancelledWords(run);
+  if (run.state === "done") return `${doneWords(run)}${isPractised ? "" : " Restart the station to use the new calibration."}`;
+  const seen = run.camera ?? run.mount;
+  if (isOfCamera(run) && !seen) return "Waiting for an image of the camera.";
+  if (seen && seen.todo.length === 0) return "Enough: solving.";
+  if (run.mount?.problem) return `These places do not fit: ${run.mount.problem}`;
+  if (seen) return capital(seen.todo[0]);
+  return run.countdown ? run.countdown.label : "Working.";
+}
+
+function isOfCamera({ request }) {
+  return request.kind === "camera" || request.kind === "mount";
+}
+
+function cancelledWords({ request, mount }) {
+  const kept = mount?.places.length ?? 0;
+  if (request.kind !== "mount" || kept === 0) return "Ended without a result; nothing was written.";
+  return `Ended without a result; ${kept} ${kept > 1 ? "places are" : "place is"} kept: a new run can go on with them.`;
+}
+
+// How many views there are, and how well they know the focal length.
+function countWords({ num_views: views, num_wanted: wanted, focal_sigma: sigma, focal_sigma_wanted: limit }) {
+  const known = sigma === null ? "not known yet" : `± ${(100 * sigma).toFixed(2)} %`;
+  return `${views} of ${wanted} views · focal length ${known}, wanted ± ${(100 * limit).toFixed(2)} %`;
+}
+
+function placesWords({ places }) {
+  const leftOut = places.flatMap((counts, index) => (counts ? [] : [index + 1]));
+  const words = `${places.length} ${places.length === 1 ? "place" : "places"} kept`;
+  return leftOut.length === 0 ? words : `${words}, far off and left out: ${leftOut.join(", ")}`;
+}
+
+// Share of the way: views count first, then the focal length.
+function progressOf({ num_views: views, num_wanted: wanted, focal_sigma: sigma, focal_sigma_wanted: limit }) {
+  return Math.min(1, views / wanted, sigma === null ? 0.5 : Math.max(0.5, limit / sigma));
+}
+
+function doneWords({ request, facts }) {
+  if (request.kind === "glove" || request.kind === "time") return "Done.";
+  if (request.kind === "mount") {
+    return `Done from ${facts.num_places} places: the mount is known to ± ${facts.sigma_rotation_deg.toFixed(2)}° and `
+      + `± ${facts.sigma_translation_mm.toFixed(1)} mm; the board is ${facts.board_scale.toFixed(3)} times as large as entered.`;
+  }
+  const [fx, fy, cx, cy] = facts.fx_fy_cx_cy_px;
+  const sigma = facts.sigma_fx_fy_cx_cy_px;
+  const one = (name, value, index) => `${name} ${value.toFixed(2)} ± ${sigma[index].toFixed(2)}`;
+  return `Done from ${facts.num_views} views: ${one("fx", fx, 0)}, ${one("fy", fy, 1)}, ${one("cx", cx, 2)}, ${one("cy", cy, 3)} px; `
+    + `residual ${facts.rms_px.toFixed(2)} px.`;
+}
+
+function capital(text) {
+  return text.charAt(0).toUpperCase() + text.slice(1);
+}
 
 const PERIOD_MS = 300;
 const API = "/v1/alignment/calibration";
-const SVG = "http://www.w3.org/2000/svg";
 const ENDED = ["done", "failed", "cancelled"];
 
 let chosen = null;
@@ -32,33 +98,20 @@ function regions(item) {
 }
 
 function row(item) {
-  const begin = item.run === null ? null : element("button", { type: "button" }, "Guided run");
-  begin?.addEventListener("click", () => choose(item));
-  return element("tr", { "data-name": item.name },
-    element("td", {}, levelBadge(LEVELS[item.state], item.state)),
-    element("td", { class: "name" }, item.title, why(item.name)),
-    element("td", { class: "number" }, ageWords(item.age_days)),
-    element("td", {}, item.sigma),
-    element("td", { class: "free" }, item.residual, why(item.meaning)),
-    element("td", {}, regions(item)),
-    element("td", { class: "free step" }, element("span", {}, ...item.reasons.map((reason) => element("strong", { class: "why" }, reason)), item.step)),
-    element("td", {}, begin));
+  const steps = element("span", {}, ...item.reasons.map((reason) => element("strong", { class: "why" }, reason)), item.step);
+  return element("tr", { "data-name": item.name }, cell(levelBadge(LEVELS[item.state], item.state)), cell([item.title, why(item.name)], "name"),
+    cell(ageWords(item.age_days), "number"), cell(item.sigma), cell([item.residual, why(item.meaning)], "free"), cell(regions(item)),
+    cell(steps, "free step"), cell(item.run && button("Guided run", () => choose(item))));
 }
 
-async function showItems() {
-  try {
-    showOverview(await get(""));
-  } catch (error) {
-    setText(find("calibration_note"), error.message);
-    find("calibration_note").dataset.level = "ERROR";
-  }
+function showItems() {
+  return attempt(find("calibration_note"), async () => showOverview(await get("")));
 }
 
 function showOverview({ items, folder, note, is_simulated: isSimulated, practice }) {
   find("item_rows").replaceChildren(...items.map(row));
   setText(find("folder"), folder);
-  setText(find("calibration_note"), note);
-  find("calibration_note").dataset.level = "WARN";
+  say(find("calibration_note"), note, "WARN");
   find("practice").hidden = !isSimulated;
   isPractised = practice === "on";
   setText(find("practice_title"), isPractised ? "Practice" : "Simulated devices");
@@ -67,17 +120,17 @@ function showOverview({ items, folder, note, is_simulated: isSimulated, practice
   find("practice_stop").hidden = !isPractised;
 }
 
-async function switchPractice(way, button) {
-  const words = button.textContent;
-  button.disabled = true;
-  setText(button, way === "start" ? "Starting, about ten seconds …" : "Stopping …");
+async function switchPractice(way, { target }) {
+  const words = target.textContent;
+  target.disabled = true;
+  setText(target, way === "start" ? "Starting, about ten seconds …" : "Stopping …");
   await act(async () => {
     const overview = await post(`/practice/${way}`);
     find("begin").hidden = find("run").hidden = true;
     showOverview(overview);
   });
-  button.disabled = false;
-  setText(button, words);
+  target.disabled = false;
+  setText(target, words);
   find(way === "start" ? "practice_stop" : "practice_start").focus();
 }
 
@@ -98,8 +151,7 @@ function choose(item) {
   (hasBoard ? find("board") : find("begin_form").querySelector("button")).focus();
 }
 
-async function begin(event) {
-  event.preventDefault();
+async function begin() {
   const board = isOfCamera({ request: chosen.run }) ? find("board").value.trim() : "";
   if (board && !isPractised) keep("board", board);
   const isResumed = chosen.num_kept_places > 0 && find("resume").checked;
@@ -116,16 +168,8 @@ async function act(action) {
     for (const id of ["run_message", "begin_note", "calibration_note"]) setText(find(id), "");
     await action();
   } catch (error) {
-    const place = find(!find("run").hidden ? "run_message" : find("begin").hidden ? "calibration_note" : "begin_note");
-    place.dataset.level = "ERROR";
-    setText(place, error.message);
+    say(find(!find("run").hidden ? "run_message" : find("begin").hidden ? "calibration_note" : "begin_note"), error.message, "ERROR");
   }
-}
-
-function shape(name, attributes) {
-  const node = document.createElementNS(SVG, name);
-  for (const [key, value] of Object.entries(attributes)) node.setAttribute(key, String(value));
-  return node;
 }
 
 function showView(seen) {
@@ -141,7 +185,7 @@ function showView(seen) {
 }
 
 function coverage({ width_px: width, height_px: height, outlines_px: outlines, views_by_region: regions_ }) {
-  const kept = outlines.map((points) => shape("polygon", { points: polygon(points), class: "kept" }));
+  const kept = outlines.map((points) => shape("polygon", { points: points.join(" "), class: "kept" }));
   const lines = [1, 2].flatMap((n) => [
     shape("line", { x1: (n * width) / 3, x2: (n * width) / 3, y1: 0, y2: height }), shape("line", { x1: 0, x2: width, y1: (n * height) / 3, y2: (n * height) / 3 })]);
   const counts = regions_.flatMap((views, y) => views.map((count, x) => {
@@ -163,7 +207,8 @@ function showMount(mount, isOn) {
   find("run_take").hidden = find("run_drop").hidden = !mount || !isOn;
   if (!mount) return;
   find("view_signs").hidden = !isOn;
-  showChildren(find("view_signs"), signsOf(mount).map(([words, isGood]) => element("li", { class: "level", "data-level": isGood ? "OK" : "WARN" }, words)));
+  const signs = [[mount.is_board_seen, "Board seen", "Board not seen"], [mount.is_tracked, "Tracker seen", "Tracker not seen"], [mount.is_still, "Still", "Moving"]];
+  showChildren(find("view_signs"), signs.map(([isGood, good, bad]) => element("li", { class: "level", "data-level": isGood ? "OK" : "WARN" }, isGood ? good : bad)));
   showChildren(find("gauges"), mount.gauges.map(gauge));
   find("run_drop").disabled = mount.places.length === 0;
 }
@@ -172,11 +217,12 @@ function showResult(run) {
   const isShown = run.state === "done" && run.request.kind === "time";
   find("result").hidden = !isShown;
   if (!isShown || shown.state === "done") return;
-  const { streams, pairs, leftOut, note } = delayRows(run.facts);
-  const table = (title, rows) => element("table", {}, element("thead", {}, element("tr", {}, element("th", { scope: "col" }, title), element("th", { scope: "col" }, "Delay (± one sigma)"))),
-    element("tbody", {}, ...rows.map(([name, words]) => element("tr", {}, element("td", { class: "name" }, name), element("td", {}, words)))));
-  find("result").replaceChildren(table("Stream", streams), table("Pair, second after first", pairs), element("p", {}, note),
-    element("ul", { class: "todo" }, ...leftOut.map((words) => element("li", {}, `Left out: ${words}`))));
+  const { streams, reference, pairs, loop_sigmas: loops, left_out: leftOut } = run.facts;
+  const delays = (title, rows) => table([title, "Delay (± one sigma)"], rows.map(([name, delay, sigma]) => [name, `${delay.toFixed(2)} ± ${sigma.toFixed(2)} ms`]));
+  find("result").replaceChildren(delays("Stream", Object.entries(streams).map(([name, { latency_ms, sigma_ms }]) => [name, latency_ms, sigma_ms])),
+    delays("Pair, second after first", pairs.map(({ a, b, offset_ms, sigma_ms }) => [`${a} – ${b}`, offset_ms, sigma_ms])),
+    element("p", {}, `Relative to ${reference}. Loops of three streams close within ${loops.toFixed(1)} standard deviations.`),
+    element("ul", { class: "todo" }, ...Object.entries(leftOut).map(([name, reason]) => element("li", {}, `Left out: ${name} ${reason}`))));
 }
 
 function showCountdown(countdown) {
@@ -185,7 +231,7 @@ function showCountdown(countdown) {
   find("countdown_bar").max = countdown.duration_s;
   find("countdown_bar").value = countdown.elapsed_s;
   find("countdown_bar").setAttribute("aria-label", countdown.label);
-  setText(find("countdown_left"), `${secondsLeft(countdown)} s`);
+  setText(find("countdown_left"), `${Math.max(0, Math.ceil(countdown.duration_s - countdown.elapsed_s - 0.05))} s`);
 }
 
 function showQuestion(run) {
@@ -197,11 +243,7 @@ function showQuestion(run) {
   find("answer").value = "";
   find("answer_field").hidden = !run.takes_text;
   setText(find("answer_action"), run.action);
-  find("answer_choices").replaceChildren(...run.choices.map(({ label, answer }) => {
-    const button = element("button", { type: "button" }, label);
-    button.addEventListener("click", () => reply(answer));
-    return button;
-  }));
+  find("answer_choices").replaceChildren(...run.choices.map(({ label, answer }) => button(label, () => reply(answer))));
   find(run.takes_text ? "answer" : "answer_action").focus();
 }
 
@@ -210,9 +252,7 @@ function showRun(run) {
   find("run").hidden = run.run_id === closed && isEnded;
   if (find("run").hidden) return;
   setText(find("run_title"), runTitle(run.request));
-  const state = find("run_state");
-  state.dataset.level = runLevel(run.state);
-  setText(state, run.state);
+  say(find("run_state"), run.state, RUN_LEVELS[run.state] ?? "STALE");
   setText(find("run_next"), nextWords(run, isPractised));
   const { camera, mount } = run;
   const seen = camera ?? mount;
@@ -251,11 +291,11 @@ function hintOf({ camera, mount, lines, countdown }, isEnded) {
 
 async function poll() {
   try {
-    const answer = await ask(`${API}/run`);
+    const answer = await api.ask(`${API}/run`);
     const run = answer.ok ? await answer.json() : null;
     if (run) showRun(run);
   } catch (error) {
-    setText(find("run_message"), `The dashboard did not answer: ${error.message}`);
+    setText(find("run_message"), error.message);
   }
   setTimeout(poll, ENDED.includes(shown.state) || shown.state === "" ? 4 * PERIOD_MS : PERIOD_MS);
 }
@@ -264,24 +304,28 @@ function reply(text) {
   return act(async () => showRun(await post("/run/answer", { text })));
 }
 
-find("begin_form").addEventListener("submit", begin);
-find("begin_back").addEventListener("click", () => { find("begin").hidden = true; });
-find("answer_form").addEventListener("submit", (event) => {
-  event.preventDefault();
-  reply(find("answer").value);
-});
-for (const way of ["start", "stop"]) find(`practice_${way}`).addEventListener("click", ({ target }) => switchPractice(way, target));
-for (const order of ["take", "drop", "finish", "cancel"]) find(`run_${order}`).addEventListener("click", () => act(async () => showRun(await post(`/run/${order}`))));
-addEventListener("keydown", (event) => {
-  const id = { t: "run_take", d: "run_drop" }[event.key.toLowerCase()];
-  if (!id || event.ctrlKey || event.metaKey || event.altKey || event.target.matches("input, select") || find("run").hidden || find(id).hidden) return;
-  event.preventDefault();
-  find(id).click();
-});
-find("run_close").addEventListener("click", () => {
+function order(name) {
+  return act(async () => showRun(await post(`/run/${name}`)));
+}
+
+function close() {
   closed = shown.run_id;
   keep("closed_run", closed, "sessionStorage");
   find("run").hidden = true;
+}
+
+onSubmit(find("begin_form"), begin);
+onSubmit(find("answer_form"), () => reply(find("answer").value));
+onClick({
+  begin_back: () => { find("begin").hidden = true; }, run_close: close,
+  practice_start: (event) => switchPractice("start", event), practice_stop: (event) => switchPractice("stop", event),
+  run_take: () => order("take"), run_drop: () => order("drop"), run_finish: () => order("finish"), run_cancel: () => order("cancel"),
+});
+addEventListener("keydown", (event) => {
+  const id = { t: "run_take", d: "run_drop" }[event.key.toLowerCase()];
+  if (!id || isModified(event) || event.target.matches("input, select") || find("run").hidden || find(id).hidden) return;
+  event.preventDefault();
+  find(id).click();
 });
 await showItems();
 poll();

@@ -1,18 +1,14 @@
 // Newest images of the cameras: thumbnails, and one of them larger. An image that is too old is removed, not kept.
 
-import { element, setText } from "./dom.js";
+import { button, element, setText } from "./dom.js";
 import { age } from "./format.js";
-import { stationPath } from "./session.js";
+import { stationPath } from "./requests.js";
 
 const STALE_S = 0.7;
 
 export class CameraPanel {
   constructor(section, row, dialog) {
-    this.section = section;
-    this.row = row;
-    this.dialog = dialog;
-    this.larger = "";
-    this.figures = new Map();
+    Object.assign(this, { section, row, dialog, larger: "", figures: new Map() });
     this.dialog.addEventListener("close", () => {
       this.larger = "";
       this.dialog.querySelector(".picture").replaceChildren();
@@ -39,11 +35,10 @@ export class CameraPanel {
   }
 
   add(name) {
-    const open = element("button", { type: "button", class: "picture", title: "Larger" });
-    open.addEventListener("click", () => {
+    const open = button([], () => {
       this.larger = name;
       this.dialog.showModal();
-    });
+    }, { class: "picture", title: "Larger" });
     const figure = element("figure", { "data-name": name }, open,
       element("figcaption", {}, label(name), " ", element("span", { class: "age quiet" })));
     this.figures.set(name, figure);

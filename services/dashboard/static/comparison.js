@@ -1,16 +1,104 @@
 // Real against imagined: replays an episode or moves hands, follows the chunks as they arrive, and goes back to any step.
 
-import { get, post } from "./catalog/api.js";
-import { chunkOf, difference, uncertaintyAt, firstUnreliable, readChunk, SIDES, stepOf } from "./comparison_chunks.js";
-import { ComparisonCharts } from "./comparison_charts.js";
-import { element, find, levelBadge, say, setText, showChildren } from "./dom.js";
+import { css } from "./canvas.js";
+import { attempt, element, find, levelBadge, onClick, onSubmit, say, setText, showChildren } from "./dom.js";
 import { number } from "./format.js";
 import { HandDriving } from "./hand_driving.js";
 import { HandCanvas } from "./hands.js";
-import { drawRgb } from "./rgb_canvas.js";
+import { ask, get, post } from "./requests.js";
 import { uncertaintyOf } from "./rollout_rows.js";
-import { ask } from "./session.js";
-import { StepPlayer } from "./step_player.js";
+import { chunkOf, difference, drawRgb, firstUnreliable, readChunk, SIDES, stepOf, StepPlayer, uncertaintyAt } from "./steps.js";
+import uPlot from "./vendor/uplot/uPlot.esm.js";
+
+const HEIGHT = 150;
+// Above it a share of the bound is drawn at the upper edge.
+const MOST = 3;
+const PLOTS = [
+  { key: "pixel_error", label: "Pixel error", range: (max) => [0, Math.max(max, 5)] },
+  { key: "pressure_error_kpa", label: "Pressure error, kPa", range: (max) => [0, Math.max(max, 0.2)] },
+  { key: "contact_f1", label: "Contact F1", range: () => [0, 1] },
+];
+const STRIP = { key: "uncertainty", label: "Uncertainty of the world model, as a share of its bound", range: (max) => [0, Math.min(MOST, Math.max(1.3, max))], isStrip: true };
+
+// Values of a plot; F1 says nothing where neither world has contact, and the start is given, not imagined.
+function series(view, key) {
+  if (key === "contact_f1") return view.contact_f1.map((value, step) => (view.in_contact[step] ? value : null));
+  if (key !== "uncertainty") return view[key];
+  return [null, ...view.uncertainties.flatMap((one) => Array(one.last_step - one.first_step + 1).fill(one.bound_share === null ? null : Math.min(MOST, one.bound_share)))];
+}
+
+class ComparisonCharts {
+  constructor(frame, strip, onStep) {
+    Object.assign(this, { frames: [[frame, PLOTS, HEIGHT], [strip, [STRIP], 130]], onStep, view: null, step: 0, plots: [] });
+    const observer = new ResizeObserver(() => this.rebuild());
+    observer.observe(frame);
+    observer.observe(strip);
+  }
+
+  rebuild() {
+    for (const { made } of this.plots) made.destroy();
+    this.plots = this.view ? this.frames.flatMap(([frame, plots, height]) => {
+      const width = Math.floor(frame.clientWidth / plots.length) - (plots.length > 1 ? 12 : 0);
+      return width > 120 ? plots.map((plot) => ({ key: plot.key, made: this.plot(plot, width, height, frame) })) : [];
+    }) : [];
+  }
+
+  plot({ key, label, range, isStrip }, width, height, frame) {
+    const axis = { stroke: css("--quiet"), grid: { stroke: css("--line"), width: 1 }, ticks: { stroke: css("--line") }, size: 42 };
+    const time = isStrip ? { values: (_, steps) => steps.map((step) => `${(step / this.view.rate_hz).toFixed(1)} s`) } : {};
+    const made = new uPlot({
+      width, height, title: label, legend: { show: false }, cursor: { drag: { x: false, y: false }, y: false },
+      scales: { x: { time: false, range: () => [0, Math.max(1, this.view.num_steps)] }, y: { range: (_, low, high) => range(high ?? 0) } },
+      axes: [{ ...axis, size: 28, ...time }, axis],
+      series: [{}, { stroke: css("--accent"), width: 1.8, points: { show: false } }],
+      hooks: { drawClear: [(plot) => this.shade(plot)], draw: [(plot) => this.mark(plot, isStrip)] },
+    }, this.data(key), frame);
+    made.over.addEventListener("click", () => this.onStep(made.posToIdx(made.cursor.left)));
+    made.root.dataset.figure = key;
+    return made;
+  }
+
+  data(key) {
+    const values = series(this.view, key);
+    return [values.map((_, step) => step), values];
+  }
+
+  band(plot, from, to, colour) {
+    const left = plot.valToPos(from, "x", true);
+    plot.ctx.fillStyle = colour;
+    plot.ctx.fillRect(left, plot.bbox.top, Math.max(1.5, plot.valToPos(to, "x", true) - left), plot.bbox.height);
+  }
+
+  // From the first unreliable chunk on, since every later step goes on from it.
+  get left() {
+    return this.view.uncertainties.find(({ uncertainty }) => uncertainty?.outside)?.first_step ?? null;
+  }
+
+  shade(plot) {
+    if (this.left !== null) this.band(plot, this.left, this.view.uncertainties.at(-1).last_step, css("--warn_ground"));
+  }
+
+  mark(plot, isStrip) {
+    if (this.left !== null) this.band(plot, this.left, this.left, css("--warn"));
+    if (isStrip) {
+      plot.ctx.fillStyle = css("--warn");
+      for (let x = plot.bbox.left; x < plot.bbox.left + plot.bbox.width; x += 8) plot.ctx.fillRect(x, plot.valToPos(1, "y", true), 4, 1.5);
+    }
+    this.band(plot, this.step, this.step, css("--ink"));
+  }
+
+  show(view) {
+    const other = this.view?.id !== view.id || this.plots.length === 0;
+    this.view = view;
+    if (other) this.rebuild();
+    else for (const { key, made } of this.plots) made.setData(this.data(key));
+  }
+
+  goTo(step) {
+    this.step = step;
+    for (const { made } of this.plots) made.redraw(false);
+  }
+}
 
 const OUTCOMES = { true: "success", false: "failure", null: "outcome unknown" };
 const RETRY_MS = 2000;
@@ -24,44 +112,38 @@ function fill(list, choices, chosen = list.value) {
 
 export class ComparisonPanel {
   constructor(heatmap) {
-    this.view = null;
-    this.chunks = [];
-    this.loading = false;
+    Object.assign(this, { view: null, chunks: [], loading: false });
     this.hands = Object.fromEntries(SIDES.map((world) => [world, Object.fromEntries(["left", "right"].map((side) =>
       [side, new HandCanvas(find(`${world}_${side}`), { summary: find(`${world}_${side}_text`) }, side, heatmap)]))]));
     this.charts = new ComparisonCharts(find("charts"), find("uncertainty_strip"), (step) => this.goTo(step));
-    this.player = new StepPlayer({ show: (step) => this.showStep(step) });
+    this.player = new StepPlayer((step) => this.showStep(step));
     this.driving = new HandDriving(find("drive_pad"), find("drive_sides"), async (moves) => this.show(await post(`/v1/comparisons/${this.view.id}/moves`, moves)));
-    find("replay").addEventListener("submit", (event) => {
-      event.preventDefault();
-      this.start({ episode_id: find("replay_episode").value });
-    });
-    find("drive").addEventListener("submit", async (event) => {
-      event.preventDefault();
+    onSubmit(find("replay"), () => this.start({ episode_id: find("replay_episode").value }));
+    onSubmit(find("drive"), async () => {
       if (await this.start({ task: find("drive_task").value, seed: Number(find("drive_seed").value) })) find("drive_pad").focus();
     });
-    find("replay_stop").addEventListener("click", () => post("/v1/comparisons/stop").catch((error) => this.say(error.message, "ERROR")));
+    onClick({
+      replay_stop: () => attempt(find("comparison_note"), () => post("/v1/comparisons/stop")),
+      comparison_pause: () => this.pause(!this.player.paused),
+      go_to_moment: () => this.goTo(this.charts.left),
+    });
     for (const one of [window, find("replay_episode")]) one.addEventListener("focus", () => this.offerAgain());
     find("comparison_step").addEventListener("input", (event) => this.goTo(Number(event.target.value)));
-    find("comparison_pause").addEventListener("click", () => this.pause(!this.player.paused));
-    find("go_to_moment").addEventListener("click", () => this.goTo(this.charts.left));
   }
 
   say(text, level) {
     say(find("comparison_note"), text, level);
   }
 
-  async start(asked) {
+  // Whether it began.
+  start(request) {
     this.say("Starting.");
-    try {
-      const view = await post("/v1/comparisons", asked);
+    return attempt(find("comparison_note"), async () => {
+      const view = await post("/v1/comparisons", request);
       this.say("");
       this.show(view);
       return true;
-    } catch (error) {
-      this.say(error.message, "ERROR");
-      return false;
-    }
+    });
   }
 
   // Robot episodes of tasks that the world model knows, with one that the address names, and tasks to move hands in.

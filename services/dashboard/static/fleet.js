@@ -1,12 +1,11 @@
 // Wall of stations: a tile each, trouble first; a tile opens its station's page.
 
 import { showImage } from "./cameras.js";
-import { element, find, levelBadge, setText } from "./dom.js";
+import { element, find, levelBadge, placeChildren, setText } from "./dom.js";
 import { age, number, plural, stopwatch } from "./format.js";
-import { Freshness } from "./freshness.js";
 import { HandCanvas } from "./hands.js";
-import { LiveLink } from "./live.js";
-import { ask, stationPath } from "./session.js";
+import { Freshness, LiveLink } from "./live.js";
+import { ask, stationPath } from "./requests.js";
 import { onTheme } from "./theme.js";
 
 const STALE_MS = 800;
@@ -89,9 +88,8 @@ function show(shown) {
     if (!tiles.has(tile.name)) tiles.set(tile.name, new StationTile(tile.name));
     tiles.get(tile.name).show(tile);
   }
-  const names = shown.map(({ name }) => name);
-  if (names.join("\n") !== order.join("\n")) find("tiles").replaceChildren(...names.map((name) => tiles.get(name).node));
-  order = names;
+  order = shown.map(({ name }) => name);
+  placeChildren(find("tiles"), order.map((name) => tiles.get(name).node));
   const counts = ["ERROR", "STALE", "WARN", "OK"].map((level) => [shown.filter((tile) => tile.level === level).length, level]);
   setText(find("counts"), `${plural(shown.length, "station")}: ${counts.filter(([count]) => count > 0).map(([count, level]) => `${count} ${level}`).join(" · ")}`);
 }
@@ -99,23 +97,19 @@ function show(shown) {
 const clearAll = (cause) => tiles.forEach((tile) => tile.clear(cause));
 const fresh = new Freshness(STALE_MS, () => clearAll("The dashboard sends no updates."));
 
-const link = new LiveLink({
-  onTopic: (topic, shown) => {
-    if (topic !== "fleet") return;
+new LiveLink({
+  topics: { fleet: (shown) => {
     fresh.note();
     show(shown);
-  },
+  } },
   onBinary: (buffer) => {
     // uint8 kind (3), uint8 place in the list, uint16 number of taxels of the left hand, float32 kPa of the left, then of the right hand.
     const view = new DataView(buffer);
     if (view.getUint8(0) === 3) tiles.get(order[view.getUint8(1)])?.showTaxels(new Float32Array(buffer, 4), view.getUint16(2, true));
   },
-  onState: (connected) => {
-    if (!connected) {
-      fresh.stop();
-      clearAll("No link to the dashboard.");
-    }
+  onLost: () => {
+    fresh.stop();
+    clearAll("No link to the dashboard.");
   },
 });
-link.show("fleet", true);
 onTheme(() => tiles.forEach((tile) => Object.values(tile.hands).forEach((hand) => hand.request())));

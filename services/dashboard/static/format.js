@@ -1,4 +1,4 @@
-// Numbers as an operator reads them; null and undefined are "–", never a zero that nobody measured.
+// Numbers, dates and times as an operator reads them; null and undefined are "–", never a zero that nobody measured.
 
 const MISSING = "–";
 
@@ -38,4 +38,18 @@ export function stopwatch(value_s) {
   const seconds = Math.max(0, value_s ?? 0);
   const minutes = Math.floor(seconds / 60);
   return `${minutes}:${(seconds - 60 * minutes).toFixed(1).padStart(4, "0")}`;
+}
+
+const form = (options) => new Intl.DateTimeFormat("en-GB", options);
+const FORMS = {
+  moment: form({ dateStyle: "medium", timeStyle: "medium" }),
+  day: form({ dateStyle: "medium" }),
+  time: form({ timeStyle: "medium" }),
+  minute: form({ timeStyle: "short" }),
+};
+
+// `at` is ISO text or seconds since 1970; what is not known, or no time, is "–".
+export function date(at, name = "moment") {
+  const moment = new Date(typeof at === "number" ? 1000 * at : at ?? "");
+  return Number.isNaN(moment.getTime()) ? "–" : FORMS[name].format(moment);
 }

@@ -1,12 +1,56 @@
-// Pressures of one hand → a canvas in hand layout. Layout and colours come from the server, which
-// takes them from dextouch.tactile.layout, so that report and page show the same picture.
+// Pressures of one hand and marks of its taxels on a canvas. Layout and colours come from the server, which takes them from dextouch.tactile, so that report and page show the same picture.
 
 import { beforeNextFrame, cleared, css } from "./canvas.js";
-import { setText } from "./dom.js";
+import { element, setText } from "./dom.js";
 import { number } from "./format.js";
-import { withLayout } from "./layouts.js";
-import { drawMark } from "./taxel_marks.js";
-import { PADS, padForces, STATES, statesOf, taxelName, trusted } from "./taxels.js";
+import { padForces, PADS, STATES, statesOf, taxelName, trusted, withLayout } from "./taxels.js";
+
+const LEGEND_PX = 16;
+
+function path(context, mark) {
+  context.beginPath();
+  const corners = {
+    cross: [[0.15, 0.15, 0.85, 0.85], [0.85, 0.15, 0.15, 0.85]],
+    bar: [[0.12, 0.5, 0.88, 0.5]],
+    triangle: [[0.5, 0.08, 0.95, 0.88, 0.05, 0.88, 0.5, 0.08]],
+    diamond: [[0.5, 0.02, 0.98, 0.5, 0.5, 0.98, 0.02, 0.5, 0.5, 0.02]],
+  };
+  for (const [x, y, ...rest] of corners[mark] ?? []) {
+    context.moveTo(x, y);
+    for (let index = 0; index < rest.length; index += 2) context.lineTo(rest[index], rest[index + 1]);
+  }
+  if (mark === "ring") context.arc(0.5, 0.5, 0.38, 0, 2 * Math.PI);
+  if (mark === "dot") context.arc(0.5, 0.5, 0.16, 0, 2 * Math.PI);
+}
+
+// One mark in a cell of size 1 at the origin; its outline in the colour of the ground keeps it visible on every pressure.
+function drawMark(context, state) {
+  const { mark, level } = STATES[state];
+  context.lineCap = context.lineJoin = "round";
+  path(context, mark);
+  context.strokeStyle = css("--panel");
+  context.lineWidth = 0.42;
+  context.stroke();
+  context.strokeStyle = context.fillStyle = css(`--${level.toLowerCase()}`);
+  context.lineWidth = 0.2;
+  if (["triangle", "dot"].includes(mark)) context.fill();
+  context.stroke();
+}
+
+export function showLegend(list, counts) {
+  const shown = Object.keys(STATES).filter((state) => counts[state]);
+  const key = shown.map((state) => `${state} ${counts[state]}`).join();
+  if (list.dataset.shown === key + css("--panel")) return;
+  list.dataset.shown = key + css("--panel");
+  list.replaceChildren(...shown.map((state) => {
+    const scale = window.devicePixelRatio || 1;
+    const canvas = element("canvas", { class: "mark", width: LEGEND_PX * scale, height: LEGEND_PX * scale, "aria-hidden": "true" });
+    const context = canvas.getContext("2d");
+    context.scale(LEGEND_PX * scale, LEGEND_PX * scale);
+    drawMark(context, state);
+    return element("li", { title: STATES[state].text, "data-state": state }, canvas, `${counts[state]} ${state}`);
+  }));
+}
 
 const GAP = 0.09;
 
@@ -20,13 +64,7 @@ function box(cells, columns) {
 export class HandCanvas {
   // `texts` may hold elements for a summary, the forces of the pads, and the taxel under the pointer.
   constructor(canvas, texts, side, heatmap) {
-    this.canvas = canvas;
-    this.texts = texts;
-    this.side = side;
-    this.ownHeatmap = heatmap;
-    this.pressures_kpa = null;
-    this.states = new Map();
-    this.hovered = null;
+    Object.assign(this, { canvas, texts, side, ownHeatmap: heatmap, pressures_kpa: null, states: new Map(), hovered: null });
     this.setHeatmap(heatmap);
     this.request = beforeNextFrame(() => this.draw());
     for (const name of ["pointermove", "pointerdown"]) canvas.addEventListener(name, (event) => this.hover(event));
@@ -56,16 +94,10 @@ export class HandCanvas {
   }
 
   update(pressures_kpa) {
-    if (pressures_kpa.length === 0) {
-      this.clear("no glove is heard");
-      return;
-    }
-    if (pressures_kpa.length !== this.cells.length) {
-      this.clear(`${pressures_kpa.length} taxels of a glove whose layout is not known here`);
-      return;
-    }
+    const count = pressures_kpa.length;
+    if (count !== this.cells.length) return this.clear(count ? `${count} taxels of a glove whose layout is not known here` : "no glove is heard");
     this.pressures_kpa = pressures_kpa;
-    this.request();
+    return this.request();
   }
 
   clear(words) {
@@ -102,9 +134,8 @@ export class HandCanvas {
   }
 
   draw() {
-    const found = cleared(this.canvas);
-    if (!found) return;
-    const { context, width, height } = found;
+    const { context, width, height } = cleared(this.canvas) ?? {};
+    if (!context) return;
     const { cell_px, left_px, top_px } = this.placement(width, height);
     context.drawImage(this.unloaded(width, height), 0, 0);
     context.setTransform(cell_px, 0, 0, cell_px, left_px, top_px);
@@ -177,7 +208,7 @@ export class HandCanvas {
     };
     for (const [taxel, state] of this.states) {
       place(taxel);
-      drawMark(context, state, css);
+      drawMark(context, state);
     }
     if (this.hovered === null) return;
     place(this.hovered);

@@ -1,7 +1,6 @@
 // Panels of a page can be hidden and enlarged; what was chosen is kept in this browser for each person, station and screen.
 
-import { element } from "./dom.js";
-import { keep, kept } from "./kept.js";
+import { button, element, keep, kept } from "./dom.js";
 
 const main = document.querySelector("main");
 const { person, station, screen } = main.dataset;
@@ -22,7 +21,7 @@ function show() {
   // What the page itself hides cannot be brought back.
   const hidden = chosen.hidden.filter((id) => panels.has(id) && !panels.get(id).hidden);
   away.hidden = !hidden.length;
-  away.replaceChildren("Hidden panels: ", ...hidden.map((id) => button(nameOf(panels.get(id)), `Show ${nameOf(panels.get(id))}`, () => choose({ hidden: chosen.hidden.filter((one) => one !== id) }))));
+  away.replaceChildren("Hidden panels: ", ...hidden.map((id) => tool(nameOf(panels.get(id)), `Show ${nameOf(panels.get(id))}`, () => choose({ hidden: chosen.hidden.filter((one) => one !== id) }))));
 }
 
 function choose(change) {
@@ -31,16 +30,13 @@ function choose(change) {
   keep(KEY, JSON.stringify(chosen));
 }
 
-function button(text, label, act) {
-  const made = element("button", { type: "button", class: "plain", "aria-label": label, title: label }, text);
-  made.addEventListener("click", act);
-  return made;
+function tool(text, label, act, attributes = {}) {
+  return button(text, act, { class: "plain", "aria-label": label, title: label, ...attributes });
 }
 
 for (const [id, panel] of panels) {
-  const enlarge = button("⤢", `Enlarge ${nameOf(panel)}`, () => choose({ enlarged: chosen.enlarged === id ? null : id }));
-  enlarge.dataset.tool = "enlarge";
-  const hide = button("×", `Hide ${nameOf(panel)}`, () => choose({ hidden: [...chosen.hidden, id], enlarged: chosen.enlarged === id ? null : chosen.enlarged }));
+  const enlarge = tool("⤢", `Enlarge ${nameOf(panel)}`, () => choose({ enlarged: chosen.enlarged === id ? null : id }), { "data-tool": "enlarge" });
+  const hide = tool("×", `Hide ${nameOf(panel)}`, () => choose({ hidden: [...chosen.hidden, id], enlarged: chosen.enlarged === id ? null : chosen.enlarged }));
   panel.append(element("div", { class: "panel_tools" }, enlarge, hide));
   new MutationObserver(show).observe(panel, { attributeFilter: ["hidden"] });
 }

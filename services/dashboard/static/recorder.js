@@ -1,16 +1,223 @@
 // Recorder panel: buttons, one-key shortcuts and a pedal → POST /v1/recorder/ACTION; what is allowed follows the state.
 
-import { post } from "./catalog/api.js";
-import { date } from "./dates.js";
-import { element, setText, showChildren } from "./dom.js";
-import { stopwatch } from "./format.js";
-import { keep, kept } from "./kept.js";
-import { Pedal } from "./pedal.js";
-import { PromptForm } from "./prompt.js";
-import { keyOf, lastTakeWords, nextStep, numSaved, verdict } from "./recorder_logic.js";
-import { ResetTimer } from "./reset_timer.js";
-import { pagePath } from "./session.js";
+import { element, find, isModified, keep, kept, onClick, onSubmit, say, setText, showChildren } from "./dom.js";
+import { date, stopwatch } from "./format.js";
+import { pagePath, post } from "./requests.js";
 import { Sounds } from "./sounds.js";
+
+const OTHER = "";
+const KEPT_PROMPT = "prompt";
+
+// A list with "other", which shows a text field in its place of choice.
+class Choice {
+  constructor(select, input) {
+    Object.assign(this, { select, input });
+    select.addEventListener("change", () => {
+      this.show();
+      if (this.isOther) input.focus();
+    });
+  }
+
+  get isOther() {
+    return this.select.value === OTHER;
+  }
+
+  get value() {
+    return (this.isOther ? this.input.value : this.select.value).trim();
+  }
+
+  set value(text) {
+    const isListed = [...this.select.options].some((option) => option.value === text);
+    this.select.value = isListed ? text : OTHER;
+    this.input.value = text;
+    this.show();
+  }
+
+  show() {
+    // Free text begins with what was chosen before: most of it often stays.
+    if (!this.isOther) this.input.value = this.select.value;
+    this.input.parentElement.hidden = !this.isOther;
+    this.input.required = this.isOther;
+  }
+}
+
+// Fields of the next take: task and instruction from the list or as free text, domain, operator, consent.
+class PromptForm {
+  constructor(form) {
+    this.form = form;
+    this.find = (id) => form.querySelector(`#${id}`);
+    this.task = new Choice(this.find("task_choice"), this.find("task"));
+    this.instruction = new Choice(this.find("instruction_choice"), this.find("instruction"));
+    this.find("task_choice").addEventListener("change", () => this.listInstructions());
+    // Consent is one person's: another operator is asked again.
+    this.find("operator").addEventListener("input", () => { this.find("consent").checked = false; });
+    this.listInstructions();
+    this.task.show();
+    const before = kept(KEPT_PROMPT, "sessionStorage");
+    if (before) this.write(JSON.parse(before));
+    for (const kind of ["input", "change"]) form.addEventListener(kind, () => this.keep());
+  }
+
+  // For this tab, so that a page that is loaded anew asks for nothing twice.
+  keep() {
+    keep(KEPT_PROMPT, JSON.stringify(this.read()), "sessionStorage");
+  }
+
+  // The chosen task's option; that of "other" has no instructions.
+  get listed() {
+    return this.find("task_choice").selectedOptions[0];
+  }
+
+  get goal() {
+    return Number(this.listed.dataset.goal ?? this.form.dataset.goal);
+  }
+
+  get reset_s() {
+    return Number(this.listed.dataset.resetS ?? this.form.dataset.resetS);
+  }
+
+  listInstructions() {
+    const instructions = JSON.parse(this.listed.dataset.instructions ?? "[]");
+    const options = instructions.map((text) => element("option", { value: text }, text));
+    this.instruction.select.replaceChildren(...options, element("option", { value: OTHER }, "Other instruction …"));
+    this.instruction.show();
+  }
+
+  read() {
+    return { task: this.task.value, instruction: this.instruction.value, domain: this.find("domain").value,
+      operator: this.find("operator").value.trim() || null, consent: this.find("consent").checked };
+  }
+
+  write(prompt) {
+    this.task.value = prompt.task;
+    this.listInstructions();
+    this.instruction.value = prompt.instruction;
+    this.find("domain").value = prompt.domain;
+    this.find("operator").value = prompt.operator ?? "";
+    this.find("consent").checked = prompt.consent;
+    this.keep();
+  }
+
+  // Who is recorded is asked once a session.
+  forget() {
+    this.write({ ...this.read(), operator: null, consent: false });
+  }
+
+  differs(prompt) {
+    const fields = this.read();
+    return Object.keys(fields).some((name) => fields[name] !== (prompt[name] ?? null));
+  }
+
+  enable(isEnabled) {
+    // A disabled field that keeps the focus would swallow keys.
+    if (!isEnabled && this.form.contains(document.activeElement)) document.activeElement.blur();
+    for (const field of this.form.elements) if (field.form === this.form && field.tagName !== "BUTTON") field.disabled = !isEnabled;
+  }
+}
+
+// Of the Latin letter at this place where another alphabet is typed.
+function keyOf(event) {
+  if (event.key.length === 1 && event.key > "\u007f" && event.code.startsWith("Key")) return event.code.slice(3).toLowerCase();
+  return event.key.toLowerCase();
+}
+
+const NEXT = { idle: "arm", armed: "record", recording: "stop", saved: "arm", discarded: "arm" };
+
+const STAGES = {
+  saved: "saved at the station, not uploaded", uploading: "uploading", refused: "refused by the store", stored: "stored",
+  aligning: "aligning", aligned: "aligned", failed: "not aligned",
+};
+const KEPT = "reset_timer";
+
+// Countdown for resetting the scene after a saved take; it goes on when the page is loaded anew.
+class ResetTimer {
+  constructor(onEnd) {
+    this.onEnd = onEnd;
+    this.running = JSON.parse(kept(KEPT, "sessionStorage"));
+  }
+
+  start(recording_id, length_s) {
+    this.running = { recording_id, ends_ms: Date.now() + 1000 * length_s };
+    keep(KEPT, JSON.stringify(this.running), "sessionStorage");
+    this.tick();
+  }
+
+  cancel() {
+    this.running = null;
+    keep(KEPT, null, "sessionStorage");
+  }
+
+  end() {
+    if (!this.running) return;
+    this.cancel();
+    this.onEnd();
+  }
+
+  // Ends with the take that it belongs to: somebody armed the next one.
+  keep(recorder) {
+    if (this.running && recorder.state !== "unknown" && (recorder.state !== "saved" || recorder.recording_id !== this.running.recording_id)) this.cancel();
+  }
+
+  get left_s() {
+    return this.running ? Math.max(0, Math.ceil((this.running.ends_ms - Date.now()) / 1000)) : null;
+  }
+
+  tick() {
+    if (this.running && Date.now() >= this.running.ends_ms) this.end();
+  }
+}
+
+const NOT_FOR_PEDALS = new Set(["escape", "tab", "shift", "control", "alt", "meta", "capslock", "arrowup", "arrowdown", "arrowleft", "arrowright"]);
+
+// A foot pedal that sends one key, learnt by pressing it.
+class Pedal {
+  constructor(button, { taken, say }) {
+    Object.assign(this, { button, taken, say, isLearning: false, key: kept("pedal") });
+    button.addEventListener("click", () => this.learn());
+    this.show();
+  }
+
+  learn() {
+    this.isLearning = true;
+    this.button.blur();
+    this.say("Press your pedal now. Esc keeps things as they are, Delete forgets the pedal.", "WARN");
+    this.show();
+  }
+
+  // A key while the pedal is being learnt.
+  take(event) {
+    const key = event.key.toLowerCase();
+    if (["shift", "control", "alt", "meta"].includes(key)) return;
+    if (key !== "escape" && key !== "delete" && (this.taken(key) || NOT_FOR_PEDALS.has(key))) {
+      this.say(`${keyName(key)} has another meaning on this page: set the pedal to another key, such as F13 or B, and press it.`, "ERROR");
+      return;
+    }
+    this.isLearning = false;
+    if (key !== "escape") {
+      this.key = key === "delete" ? null : key;
+      keep("pedal", this.key);
+    }
+    this.say(this.key && key !== "escape" ? `Pedal: ${keyName(this.key)}. Each press is the next step: arm, record, stop, save.` : "", "OK");
+    this.show();
+  }
+
+  matches(event) {
+    return this.key !== null && event.key.toLowerCase() === this.key;
+  }
+
+  get name() {
+    return this.key === null ? "" : keyName(this.key);
+  }
+
+  show() {
+    this.button.textContent = this.isLearning ? "Press your pedal now" : `Pedal: ${this.name || "none"}`;
+  }
+}
+
+function keyName(key) {
+  if (key === " ") return "Space";
+  return key.length === 1 ? key.toUpperCase() : key[0].toUpperCase() + key.slice(1);
+}
 
 const CONFIRM_MS = 3000;
 const QUESTIONS = {
@@ -22,22 +229,14 @@ const SOUNDS = { recording: "start", checking: "stop", saved: "saved" };
 
 export class RecorderPanel {
   constructor(root) {
-    this.find = (id) => document.getElementById(id);
     this.buttons = [...root.querySelectorAll("button[data-action]")];
     this.outcomes = [...root.querySelectorAll("input[name=outcome]")];
-    this.recorder = null;
-    this.level = "STALE";
-    this.received_ms = 0;
-    this.judged_id = null;
-    this.armed = "";
-    this.asked = null;
-    this.acting = Promise.resolve();
-    this.numActing = 0;
-    this.message = { text: "", level: "OK", until_ms: 0 };
-    this.prompt = new PromptForm(this.find("prompt"));
-    this.sounds = new Sounds(this.find("sounds"));
-    this.reset = new ResetTimer(() => { if (this.find("arm_again").checked) this.act("arm"); });
-    this.pedal = new Pedal(this.find("pedal"), { taken: (key) => this.hotkeys.has(key), say: (text, level) => this.say(text, level) });
+    Object.assign(this, { recorder: null, level: "STALE", received_ms: 0, judged_id: null, armed: "", question: null });
+    Object.assign(this, { acting: Promise.resolve(), numActing: 0, message: { text: "", level: "OK", until_ms: 0 } });
+    this.prompt = new PromptForm(find("prompt"));
+    this.sounds = new Sounds(find("sounds"));
+    this.reset = new ResetTimer(() => { if (find("arm_again").checked) this.act("arm"); });
+    this.pedal = new Pedal(find("pedal"), { taken: (key) => this.hotkeys.has(key), say: (text, level) => this.say(text, level) });
     // Letters go to a field, and press a button.
     const others = [...root.querySelectorAll("[data-key]:not([data-action], [name=outcome])")];
     this.hotkeys = new Map([
@@ -52,21 +251,14 @@ export class RecorderPanel {
   }
 
   listen() {
-    for (const button of this.buttons) {
-      if (button.type === "button") button.addEventListener("click", () => this.act(button.dataset.action));
-    }
+    for (const one of this.buttons) if (one.type === "button") one.addEventListener("click", () => this.act(one.dataset.action));
     for (const outcome of this.outcomes) outcome.addEventListener("change", () => this.judge());
-    this.find("skip_reset").addEventListener("click", () => this.reset.end());
-    this.find("show_keys").addEventListener("click", () => this.help());
-    this.find("arm_again").checked = kept("arm_again") === "yes";
-    this.find("arm_again").addEventListener("change", (event) => keep("arm_again", event.target.checked ? "yes" : "no"));
+    onClick({ skip_reset: () => this.reset.end(), show_keys: () => this.help() });
+    find("arm_again").checked = kept("arm_again") === "yes";
+    find("arm_again").addEventListener("change", (event) => keep("arm_again", event.target.checked ? "yes" : "no"));
     document.addEventListener("keydown", (event) => this.onKey(event));
-    const form = this.find("prompt");
-    form.addEventListener("submit", (event) => {
-      event.preventDefault();
-      this.act("arm");
-    });
-    for (const kind of ["input", "change"]) form.addEventListener(kind, () => this.enable());
+    onSubmit(find("prompt"), () => this.act("arm"));
+    for (const kind of ["input", "change"]) find("prompt").addEventListener(kind, () => this.enable());
     setInterval(() => this.tick(), 100);
   }
 
@@ -80,14 +272,14 @@ export class RecorderPanel {
     const isField = target instanceof HTMLSelectElement || target instanceof HTMLInputElement;
     const isTyping = target instanceof HTMLInputElement && !["checkbox", "radio"].includes(target.type);
     if (isField && event.key === "Escape") target.blur();
-    if (event.repeat || event.ctrlKey || event.metaKey || event.altKey) return;
+    if (event.repeat || isModified(event)) return;
     if (this.pedal.matches(event) && !(isTyping && event.key.length === 1)) {
       event.preventDefault();
-      if (!this.find("keys").open) this.step();
+      if (!find("keys").open) this.step();
       return;
     }
     const run = isTyping ? null : this.hotkeys.get(keyOf(event));
-    if (!run || (this.find("keys").open && event.key !== "?")) return;
+    if (!run || (find("keys").open && event.key !== "?")) return;
     // Also where the action is not possible now: a letter must not choose another entry of a list.
     event.preventDefault();
     run();
@@ -102,19 +294,15 @@ export class RecorderPanel {
   // The next sensible action, for a pedal; one that bounces does not record and stop at once.
   step() {
     if (this.numActing > 0) return;
-    const action = nextStep({ state: this.recorder?.state, judged: this.outcome() !== undefined, changed: this.changed() });
-    if (action === "judge" || action === null || !this.allows(action)) this.sounds.play("problem");
-    else this.act(action);
+    const state = this.recorder?.state;
+    const action = state === "checking" && this.outcome() !== undefined ? "save" : this.changed() ? "arm" : NEXT[state];
+    if (action && this.allows(action)) this.act(action);
+    else this.sounds.play("problem");
   }
 
   help() {
-    const dialog = this.find("keys");
-    if (dialog.open) {
-      dialog.close();
-      return;
-    }
-    setText(this.find("pedal_key"), this.pedal.name || "none");
-    dialog.showModal();
+    setText(find("pedal_key"), this.pedal.name || "none");
+    find("keys")[find("keys").open ? "close" : "showModal"]();
   }
 
   allows(action) {
@@ -141,12 +329,11 @@ export class RecorderPanel {
   // Throwing a take away, or keeping one with holes, takes the same key twice.
   confirmed(action, question) {
     const now_ms = performance.now();
-    if (this.asked === action && now_ms < this.message.until_ms) {
-      this.asked = null;
-      return true;
-    }
+    const isConfirmed = this.question === action && now_ms < this.message.until_ms;
+    this.question = null;
+    if (isConfirmed) return true;
     this.say(`${question} Once more within three seconds to do it.`, "WARN", CONFIRM_MS);
-    this.asked = action;
+    this.question = action;
     return false;
   }
 
@@ -164,7 +351,7 @@ export class RecorderPanel {
     if (action === "save" && this.outcome() === undefined) return false;
     if (action in QUESTIONS) return this.confirmed(action, QUESTIONS[action]);
     if (action === "save" && !this.recorder.complete) return this.confirmed(action, "This take is incomplete. Save it anyway?");
-    return action !== "arm" || this.find("prompt").reportValidity();
+    return action !== "arm" || find("prompt").reportValidity();
   }
 
   // One action after the other: a key that is pressed before the last answer came is not lost.
@@ -188,18 +375,14 @@ export class RecorderPanel {
       if (action === "session") this.prompt.forget();
       if (action === "save") this.reset.start(data.recording_id, this.prompt.reset_s);
     } catch (error) {
-      this.fail(error.cause ? error.message : `The dashboard did not answer: ${error.message}`);
+      this.say(error.message, "ERROR");
+      this.sounds.play("problem");
     }
     this.reset.tick();
   }
 
-  fail(text) {
-    this.say(text, "ERROR");
-    this.sounds.play("problem");
-  }
-
   say(text, level, lasts_ms = Infinity) {
-    this.asked = null;
+    this.question = null;
     this.message = { text, level, until_ms: performance.now() + lasts_ms };
     this.tick();
   }
@@ -221,9 +404,9 @@ export class RecorderPanel {
     this.recorder = recorder;
     this.level = level;
     this.received_ms = performance.now();
-    for (const id of ["recorder_state", "stage"]) this.find(id).dataset.state = recorder.state;
-    setText(this.find("recorder_state"), recorder.state === "unknown" ? "no station" : recorder.state);
-    for (const field of ["operator", "consent"]) this.find(field).required = recorder.needs_consent ?? false;
+    for (const id of ["recorder_state", "stage"]) find(id).dataset.state = recorder.state;
+    setText(find("recorder_state"), recorder.state === "unknown" ? "no station" : recorder.state);
+    for (const field of ["operator", "consent"]) find(field).required = recorder.needs_consent ?? false;
     this.reset.keep(recorder);
     this.forgetOutcome(recorder);
     this.takePrompt(recorder);
@@ -246,15 +429,15 @@ export class RecorderPanel {
   }
 
   showLast(take) {
-    const line = this.find("last_take");
+    const line = find("last_take");
     line.hidden = !take;
     line.dataset.level = take?.level ?? "OK";
     line.dataset.stage = take?.stage ?? "";
-    const link = this.find("last_take_link");
+    const link = find("last_take_link");
     setText(link, take?.recording_id ?? "");
     if (take?.player) link.href = pagePath(`/episodes/${take.player}`);
     else link.removeAttribute("href");
-    setText(this.find("last_take_text"), lastTakeWords(take));
+    setText(find("last_take_text"), take ? [STAGES[take.stage] ?? take.stage, take.reason].filter(Boolean).join(" · ") : "");
   }
 
   // An outcome belongs to one take: it is asked anew at every other.
@@ -273,52 +456,49 @@ export class RecorderPanel {
 
   showVerdict(recorder) {
     const isJudged = ["checking", "saved"].includes(recorder.state);
-    this.find("verdict").hidden = !isJudged;
+    find("verdict").hidden = !isJudged;
     if (!isJudged) return;
-    const { word, note, cause, advice } = verdict(recorder);
-    this.find("verdict").dataset.level = recorder.level;
-    setText(this.find("verdict_word"), word);
-    setText(this.find("verdict_cause"), cause);
-    setText(this.find("verdict_advice"), advice);
-    setText(this.find("recorder_note"), note);
-    const list = this.find("recorder_problem_list");
-    this.find("recorder_problems").classList.toggle("plain", recorder.problems.length === 0);
-    if (recorder.recording_id !== this.verdict_id) this.find("recorder_problems").open = false;
+    const counted = recorder.num_findings ?? 0;
+    find("verdict").dataset.level = recorder.level;
+    setText(find("verdict_word"), !recorder.complete ? "Incomplete" : counted ? "Complete, with warnings" : "Complete");
+    setText(find("verdict_cause"), recorder.cause ?? "");
+    setText(find("verdict_advice"), recorder.advice ?? "");
+    setText(find("recorder_note"), [recorder.recording_id, counted === 1 ? "1 finding" : `${counted || "no"} findings`].filter(Boolean).join(" · "));
+    find("recorder_problems").classList.toggle("plain", recorder.problems.length === 0);
+    if (recorder.recording_id !== this.verdict_id) find("recorder_problems").open = false;
     this.verdict_id = recorder.recording_id;
-    showChildren(list, recorder.problems.map((problem) => element("li", {}, problem)));
+    showChildren(find("recorder_problem_list"), recorder.problems.map((problem) => element("li", {}, problem)));
   }
 
   enable() {
     const blocked = { record: this.changed(), save: this.outcome() === undefined };
     for (const button of this.buttons) button.disabled = !this.allows(button.dataset.action) || (blocked[button.dataset.action] ?? false);
     const state = this.recorder?.state;
-    this.find("outcome").disabled = state !== "checking";
+    find("outcome").disabled = state !== "checking";
     this.prompt.enable(!["recording", "checking"].includes(state));
     this.showCount();
   }
 
   showCount() {
     const { task, operator, consent } = this.prompt.read();
-    const saved = numSaved(this.recorder?.session, task, operator);
+    const saved = this.recorder?.session?.saved?.find((item) => item.task === task && (item.operator ?? null) === operator)?.num_saved ?? 0;
     const { goal } = this.prompt;
-    const box = this.find("count");
+    const box = find("count");
     box.dataset.level = goal > 0 && saved >= goal ? "OK" : "";
-    setText(this.find("num_saved"), goal > 0 ? `${saved} / ${goal}` : String(saved));
+    setText(find("num_saved"), goal > 0 ? `${saved} / ${goal}` : String(saved));
     const reached = box.dataset.level === "OK" ? "goal reached" : "saved";
-    setText(this.find("count_of"), `${reached} · ${task || "no task"} · ${operator ?? "no operator"}${consent ? ", consent given" : ""} · since ${date(this.recorder?.session?.started_at, "minute")}`);
+    setText(find("count_of"), `${reached} · ${task || "no task"} · ${operator ?? "no operator"}${consent ? ", consent given" : ""} · since ${date(this.recorder?.session?.started_at, "minute")}`);
   }
 
   tick() {
     this.reset.tick();
     const lasts = performance.now() < this.message.until_ms && this.message.text !== "";
-    const message = this.find("recorder_message");
-    message.dataset.level = lasts ? this.message.level : "";
-    setText(message, lasts ? this.message.text : this.hint());
-    this.find("outcome").classList.toggle("wanted", this.recorder?.state === "checking" && this.outcome() === undefined);
-    this.find("reset").hidden = !this.reset.running;
-    setText(this.find("reset_left"), `${this.reset.left_s ?? 0} s`);
+    say(find("recorder_message"), lasts ? this.message.text : this.hint(), lasts ? this.message.level : null);
+    find("outcome").classList.toggle("wanted", this.recorder?.state === "checking" && this.outcome() === undefined);
+    find("reset").hidden = !this.reset.running;
+    setText(find("reset_left"), `${this.reset.left_s ?? 0} s`);
     if (!this.recorder) return;
     const running_s = this.recorder.state === "recording" ? (performance.now() - this.received_ms) / 1000 : 0;
-    setText(this.find("recorder_clock"), stopwatch((this.recorder.elapsed_s ?? 0) + running_s));
+    setText(find("recorder_clock"), stopwatch((this.recorder.elapsed_s ?? 0) + running_s));
   }
 }

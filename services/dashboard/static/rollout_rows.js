@@ -1,6 +1,6 @@
 // Open rollouts and those that ended last → rows of the table, and the words for their state, uncertainty and outcome.
 
-import { element, levelBadge, showChildren } from "./dom.js";
+import { button, cell, element, levelBadge, showChildren, why, wideRow } from "./dom.js";
 import { age } from "./format.js";
 
 const IDLE_S = 30;
@@ -38,33 +38,22 @@ export function outcomeOf({ success, rollout_doubt: whole }) {
   return estimate === null ? "–" : `success with ${(100 * estimate).toFixed(0)} %, imagined`;
 }
 
-function why(text) {
-  return text ? element("span", { class: "why" }, text) : null;
-}
-
 function rolloutRow(rollout, isWatched, watch) {
   const state = stateOf(rollout);
   const uncertainty = uncertaintyOf(rollout);
-  const button = rollout.isOver ? "" : element("button", { type: "button", "aria-pressed": isWatched }, isWatched ? "Watching" : "Watch");
-  if (button) button.addEventListener("click", () => watch(rollout));
   return element("tr", { "data-level": state.level === "OK" ? null : state.level, "data-watch": rollout.isOver ? null : rollout.watch_id,
     "data-over": rollout.isOver ? rollout.watch_id : null, "data-key": `${rollout.watch_id}${Boolean(rollout.isOver)}` },
-    element("td", {}, levelBadge(state.level, state.word), why(rollout.ended)),
-    element("td", { class: "name" }, rollout.world, why(KINDS[rollout.kind] ?? rollout.service)),
-    element("td", {}, rollout.client || "not named", why(rollout.key && rollout.key !== WITHOUT_KEYS ? `key ${rollout.key}` : "")),
-    element("td", { class: "task" }, rollout.task, why(rollout.instruction)),
-    element("td", { class: "number" }, String(rollout.next_chunk)),
-    element("td", { class: "number" }, String(rollout.last_step), why(rollout.model_rate_hz ? `${(rollout.last_step / rollout.model_rate_hz).toFixed(1)} s` : "")),
-    element("td", { class: "number" }, age(rollout.age_s)),
-    element("td", { class: "number" }, age(rollout.idle_s)),
-    element("td", { class: "uncertainty" }, uncertainty.text, why(uncertainty.reason)),
-    element("td", { class: "outcome" }, outcomeOf(rollout), why(rollout.isOver && rollout.rollout_doubt?.reason ? "unreliable" : "")),
-    element("td", {}, button));
+    cell([levelBadge(state.level, state.word), why(rollout.ended)]), cell([rollout.world, why(KINDS[rollout.kind] ?? rollout.service)], "name"),
+    cell([rollout.client || "not named", why(rollout.key && rollout.key !== WITHOUT_KEYS ? `key ${rollout.key}` : "")]),
+    cell([rollout.task, why(rollout.instruction)], "task"), cell(String(rollout.next_chunk), "number"),
+    cell([String(rollout.last_step), why(rollout.model_rate_hz ? `${(rollout.last_step / rollout.model_rate_hz).toFixed(1)} s` : "")], "number"),
+    cell(age(rollout.age_s), "number"), cell(age(rollout.idle_s), "number"), cell([uncertainty.text, why(uncertainty.reason)], "uncertainty"),
+    cell([outcomeOf(rollout), why(rollout.isOver && rollout.rollout_doubt?.reason ? "unreliable" : "")], "outcome"),
+    cell(rollout.isOver ? "" : button(isWatched ? "Watching" : "Watch", () => watch(rollout), { "aria-pressed": isWatched })));
 }
 
 export function showRollouts(body, { rollouts, over = [] }, watched, watch) {
   const rows = [...rollouts, ...over.map((one) => ({ ...one, isOver: true }))].map((one) => rolloutRow(one, one.watch_id === watched, watch));
-  const empty = element("tr", {}, element("td", { colspan: 11, class: "free" },
-    "No open rollouts. A policy that is evaluated in one of the worlds appears here; the last ten stay with their outcome."));
+  const empty = wideRow(11, "No open rollouts. A policy that is evaluated in one of the worlds appears here; the last ten stay with their outcome.");
   showChildren(body, rollouts.length ? rows : [empty, ...rows]);
 }

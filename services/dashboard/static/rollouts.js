@@ -1,14 +1,12 @@
 // The rollouts screen: open rollouts of all worlds, and the newest steps of the one that is watched.
 
 import { ComparisonPanel } from "./comparison.js";
-import { element, find, levelBadge, say, setText } from "./dom.js";
+import { element, find, levelBadge, onClick, say, setText } from "./dom.js";
 import { HandCanvas } from "./hands.js";
 import { LiveLink } from "./live.js";
-import { drawRgb } from "./rgb_canvas.js";
-import { outcomeOf, uncertaintyOf, showRollouts, stateOf } from "./rollout_rows.js";
-import { ask, pagePath } from "./session.js";
-import { imageOf, readSteps, touchOf } from "./step_messages.js";
-import { StepPlayer } from "./step_player.js";
+import { ask, pagePath } from "./requests.js";
+import { outcomeOf, showRollouts, stateOf, uncertaintyOf } from "./rollout_rows.js";
+import { drawRgb, imageOf, readSteps, StepPlayer, touchOf } from "./steps.js";
 import { onTheme } from "./theme.js";
 
 const heatmap = await (await ask("/v1/heatmap")).json();
@@ -20,7 +18,7 @@ let watched = null; // { topic, rollout } of the rollout that is shown
 let steps = null;
 
 const comparison = new ComparisonPanel(heatmap);
-const player = new StepPlayer({ show: showStep });
+const player = new StepPlayer(showStep);
 
 function topicOf(rollout) {
   return `rollout/${rollout.service}/${rollout.watch_id}`;
@@ -80,11 +78,8 @@ function showListed(view) {
     // What was shown last stays, with what came of it; so it does while a world does not answer.
     about({ ...over, isOver: true });
   } else if (!watched) {
-    const wanted = view.rollouts.find((one) => `#${topicOf(one)}` === location.hash);
-    if (wanted) {
-      watch(wanted);
-      return;
-    }
+    const named = view.rollouts.find((one) => `#${topicOf(one)}` === location.hash);
+    if (named) watch(named);
   }
   showTable();
 }
@@ -102,8 +97,7 @@ function showSteps(message) {
   row.replaceChildren(...message.cameras.map((camera) => element("figure", {},
     element("canvas", { class: "rgb", role: "img", "aria-label": `image of ${camera.name}`, "data-camera": camera.name }),
     element("figcaption", {}, camera.name.replace(/^camera_/, "").replaceAll("_", " ")))));
-  const slider = find("step");
-  slider.max = message.header.steps.length - 1;
+  find("step").max = message.header.steps.length - 1;
   player.load(message.header.steps.length, watched.rollout.model_rate_hz);
 }
 
@@ -127,36 +121,30 @@ function showStep(index) {
 }
 
 const link = new LiveLink({
-  onTopic: (topic, data) => {
-    if (topic === "rollouts") showListed(data);
-    else if (topic === "comparison") comparison.show(data);
-    else if (topic === watched?.topic) {
-      note(`${data.gone ? "This rollout is over: " : ""}${data.note}`, "WARN");
-      if (data.gone && !listed.over.some((one) => topicOf(one) === topic)) about({ ...watched.rollout, isOver: true });
-    }
+  topics: { rollouts: showListed, comparison: (view) => comparison.show(view) },
+  onOther: (topic, data) => {
+    if (topic !== watched?.topic) return;
+    note(`${data.gone ? "This rollout is over: " : ""}${data.note}`, "WARN");
+    if (data.gone && !listed.over.some((one) => topicOf(one) === topic)) about({ ...watched.rollout, isOver: true });
   },
   onBinary: (buffer) => {
     const message = readSteps(buffer);
     if (message) showSteps(message);
   },
-  onState: (connected) => {
-    if (!connected) showListed({ ...listed, problems: ["No link to the dashboard: what you see is old."] });
-  },
+  onLost: () => showListed({ ...listed, problems: ["No link to the dashboard: what you see is old."] }),
 });
 
-link.show("rollouts", true);
-link.show("comparison", true);
 new IntersectionObserver((entries) => {
   for (const entry of entries) if (watched) link.show(watched.topic, entry.isIntersecting);
 }).observe(find("watched"));
-find("stop_watching").addEventListener("click", () => watch(null));
-find("pause").addEventListener("click", () => {
-  player.pause(!player.paused);
-  setText(find("pause"), player.paused ? "Play" : "Pause");
-});
+function pause(isPaused) {
+  player.pause(isPaused);
+  setText(find("pause"), isPaused ? "Play" : "Pause");
+}
+
+onClick({ stop_watching: () => watch(null), pause: () => pause(!player.paused) });
 find("step").addEventListener("input", (event) => {
-  player.pause(true);
-  setText(find("pause"), "Play");
+  pause(true);
   player.goTo(Number(event.target.value));
 });
 const draw = () => {

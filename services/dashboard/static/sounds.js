@@ -1,6 +1,6 @@
-// Sounds of the recorder, made by oscillators; off until the operator switches them on in this browser.
+// Sounds of the recorder, made by oscillators, and the lines that say whether the robot's hand can follow, which have one of them.
 
-import { keep, kept } from "./kept.js";
+import { find, keep, kept, say } from "./dom.js";
 
 // Frequency in Hz, start and length in s, and the form of the wave.
 const TONES = {
@@ -15,9 +15,7 @@ const RAMP_S = 0.012;
 
 export class Sounds {
   constructor(button) {
-    this.button = button;
-    this.isOn = kept("sounds") === "on";
-    this.context = null;
+    Object.assign(this, { button, isOn: kept("sounds") === "on", context: null });
     button.addEventListener("click", () => this.toggle());
     // Browsers stay silent until the page was used once.
     for (const kind of ["keydown", "pointerdown"]) document.addEventListener(kind, () => this.wake(), { capture: true });
@@ -58,5 +56,36 @@ export class Sounds {
       oscillator.start(begin_s);
       oscillator.stop(end_s);
     }
+  }
+}
+
+// Shorter ones an operator cannot react to.
+const LASTS_S = 0.3;
+// Chosen: rare enough not to annoy, often enough to be missed when the motion was changed.
+const QUIET_MS = 5000;
+
+export class FollowLines {
+  constructor(sounds) {
+    this.lines = Object.fromEntries(["left", "right"].map((side) => [side, find(`hand_${side}_follow`)]));
+    Object.assign(this, { sounds, wasLost: false, played_ms: -Infinity });
+    this.box = find("follow_sound");
+    this.box.checked = kept("follow_sound") !== "no";
+    this.box.addEventListener("change", () => keep("follow_sound", this.box.checked ? "yes" : "no"));
+  }
+
+  // `following` by side as the station says it; a hand that is not tracked has none.
+  show(following, isRecording) {
+    for (const [side, line] of Object.entries(this.lines)) {
+      const hand = following[side];
+      line.hidden = !hand;
+      say(line, hand?.message ?? "", hand?.level);
+    }
+    const isLost = Object.values(following).some(({ level, lasted_s }) => level === "WARN" && lasted_s > LASTS_S);
+    const isNew = isLost && !this.wasLost && performance.now() - this.played_ms > QUIET_MS;
+    if (isRecording && isNew && this.box.checked) {
+      this.sounds.play("follow");
+      this.played_ms = performance.now();
+    }
+    this.wasLost = isLost;
   }
 }

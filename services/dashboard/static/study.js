@@ -1,12 +1,18 @@
 // One study: its tables, sorted as the operator wants, and its rollouts, disagreements first; what it has none of is hidden.
 
-import { get } from "./catalog/api.js";
-import { element, find, say, setText } from "./dom.js";
+import { attempt, button, cell, element, find, headRow, newestOnly, onClick, say, setText } from "./dom.js";
 import { LiveLink } from "./live.js";
-import { ask, checked } from "./session.js";
-import { sorted } from "./sorting.js";
-import { progress, stateBadge } from "./study_parts.js";
-import { agreementRow, rateCell, rateRows, rolloutRow } from "./study_tables.js";
+import { ask, checked, get, getIfServed } from "./requests.js";
+import { agreementRow, rateCell, rateRows, rolloutRow, stateBadge, studyProgress } from "./study_tables.js";
+
+// Missing values come last in either direction.
+function sorted(rows, valueOf, descending) {
+  return [...rows].sort((a, b) => {
+    const [one, other] = [valueOf(a) ?? null, valueOf(b) ?? null];
+    if (one === null || other === null) return (one === null) - (other === null);
+    return (descending ? -1 : 1) * (typeof one === "string" ? one.localeCompare(other) : one - other);
+  });
+}
 
 const PAGE = 50;
 const RETRY_MS = 5000;
@@ -17,43 +23,43 @@ let figures = null;
 let order = { key: "task", descending: false };
 let filter = null; // disagreements where there are any, else all, until the operator chooses
 let rows = [];
-let pictures = 0; // that were asked for
 
-function sortButton(key, label) {
-  const button = element("button", { type: "button", class: "sort" }, label);
-  button.addEventListener("click", () => {
+function sortColumn(key, label) {
+  const sort = button(label, () => {
     order = { key, descending: order.key === key ? !order.descending : key.startsWith("world:") };
     showRates();
-  });
-  const direction = order.key === key ? (order.descending ? "descending" : "ascending") : "none";
-  return element("th", { scope: "col", "aria-sort": direction }, button);
+  }, { class: "sort" });
+  return [sort, { "aria-sort": order.key === key ? (order.descending ? "descending" : "ascending") : "none" }];
+}
+
+function showTable(id, heads, rows) {
+  find(id).tHead.replaceChildren(headRow(heads));
+  find(id).tBodies[0].replaceChildren(...rows);
 }
 
 function showRates() {
   const worlds = ["real", ...figures.summary.worlds];
   const valueOf = order.key.startsWith("world:")
     ? (row) => row.worlds[order.key.slice("world:".length)]?.rate : (row) => row[order.key];
-  find("rates").tHead.replaceChildren(element("tr", {}, sortButton("task", "Task"), sortButton("policy", "Policy"),
-    ...worlds.map((world) => sortButton(`world:${world}`, world === "real" ? "real" : `${world} (imagined)`))));
-  find("rates").tBodies[0].replaceChildren(...sorted(rateRows(figures.rates), valueOf, order.descending).map((row) =>
-    element("tr", { "data-task": row.task, "data-policy": row.policy }, element("td", {}, row.task), element("td", { class: "name" }, row.policy),
+  const heads = [sortColumn("task", "Task"), sortColumn("policy", "Policy"), ...worlds.map((world) => sortColumn(`world:${world}`, world === "real" ? "real" : `${world} (imagined)`))];
+  showTable("rates", heads, sorted(rateRows(figures.rates), valueOf, order.descending).map((row) =>
+    element("tr", { "data-task": row.task, "data-policy": row.policy }, cell(row.task), cell(row.policy, "name"),
       ...worlds.map((world) => rateCell(row.worlds[world], ({ world: of, task, policy }) => open({ world: of, task, policy }))))));
 }
 
 function showFigures() {
   const { summary, meanings } = figures;
   setText(find("study_title"), summary.title || summary.name);
-  find("study_state").replaceChildren(stateBadge(summary), progress(summary));
+  find("study_state").replaceChildren(stateBadge(summary), studyProgress(summary));
   setText(find("summary"), summary.worlds.length ? `${figures.num_disagreements} imagined outcomes differ from the real ones` : "no imagined world to compare");
   setText(find("rate_meaning"), `${meanings.rate} Cannot tell: ${meanings.unreliable}`);
   const named = [["Pearson", "pearson"], ["Mean absolute error", "mean_absolute_error"], ["MMRV", "mmrv"], ["Bias", "bias"], ["Intervals", "interval"]];
   find("meanings").replaceChildren(...named.flatMap(([label, key]) => [element("dt", {}, label), element("dd", {}, meanings[key])]));
   showRates();
-  const heads = [["World", ""], ["Task", ""], ["Pearson", "number"], ["Mean absolute error", "number"], ["MMRV", "number"], ["Bias", "number"], ["Chance", "number"], ["Policies × starts", "number"], ["Comments", ""]];
   const chance = "share of all pairings of the policies' rates that correlate at least as well";
-  find("agreement").tHead.replaceChildren(element("tr", {}, ...heads.map(([label, kind]) =>
-    element("th", { scope: "col", class: kind || null, title: label === "Chance" ? chance : null }, label))));
-  find("agreement").tBodies[0].replaceChildren(...figures.agreement.map(agreementRow));
+  const numbers = ["Pearson", "Mean absolute error", "MMRV", "Bias", "Chance", "Policies × starts"];
+  const heads = numbers.map((label) => [label, { class: "number", title: label === "Chance" ? chance : null }]);
+  showTable("agreement", ["World", "Task", ...heads, "Comments"], figures.agreement.map(agreementRow));
   showChoices(summary);
   find("agreement_section").hidden = figures.agreement.length === 0;
   find("rollouts_section").hidden = summary.num_done === 0;
@@ -61,21 +67,13 @@ function showFigures() {
 }
 
 // The picture that goes into a paper, in the colours of this page; its links give it on white.
-async function showPicture() {
+const showPicture = newestOnly(async () => {
   const query = { world: find("picture_world").value, task: find("picture_task").value };
   const address = (form) => `${base}/picture?${new URLSearchParams({ ...query, form })}`;
   for (const form of ["svg", "png", "tex"]) find(`picture_${form}`).href = address(form);
-  const number = (pictures += 1);
-  let shown;
-  try {
-    const drawn = new DOMParser().parseFromString(await (await checked(await ask(address("svg")))).text(), "image/svg+xml");
-    shown = document.importNode(drawn.documentElement, true);
-  } catch (error) {
-    shown = element("p", { class: "note", "data-level": "ERROR" }, error.message);
-  }
-  // Of an older choice, which a newer one has replaced.
-  if (number === pictures) find("picture").replaceChildren(shown);
-}
+  return (await checked(await ask(address("svg")))).text();
+}, (text) => find("picture").replaceChildren(document.importNode(new DOMParser().parseFromString(text, "image/svg+xml").documentElement, true)),
+(error) => find("picture").replaceChildren(element("p", { class: "note", "data-level": "ERROR" }, error.message)));
 
 function showChoices({ worlds, tasks }) {
   const options = (values) => values.map((value) => element("option", { value }, value || "all tasks"));
@@ -86,23 +84,21 @@ function showChoices({ worlds, tasks }) {
   if (worlds.length) showPicture();
 }
 
+// One request for all: at most two episodes a rollout of a page.
 async function findPlayable(found) {
   const ids = [...new Set(found.flatMap((one) => [one.episode_id, one.real_episode_id]))].filter((id) => id && !playable.has(id));
-  const next = async () => {
-    for (let id = ids.pop(); id; id = ids.pop()) {
-      const answer = await ask(`/v1/episode_store/episodes/${encodeURIComponent(id)}`).catch(() => null);
-      playable.set(id, Boolean(answer?.ok));
-    }
-  };
-  await Promise.all([next(), next(), next(), next()]);
+  if (!ids.length) return;
+  const query = new URLSearchParams([["kind", "episode"], ["limit", 2 * PAGE], ...ids.map((id) => ["id", id])]);
+  const { items } = await getIfServed(`/v1/episode_store/catalog/items?${query}`, { items: [] });
+  const stored = new Set(items.map(({ id }) => id));
+  for (const id of ids) playable.set(id, stored.has(id));
 }
 
 function showRollouts(total) {
   const kept = new Set([...playable].filter(([, has]) => has).map(([id]) => id));
-  const heads = ["Agrees", "World", "Task", "Policy", "Seed", "Outcome", "Real outcome", "Probe", "Cannot tell", "Play"];
-  find("rollouts").tHead.replaceChildren(element("tr", {}, ...heads.map((label) =>
-    element("th", { scope: "col", class: ["Seed", "Probe"].includes(label) ? "number" : null }, label))));
-  find("rollouts").tBodies[0].replaceChildren(...rows.map((row) => rolloutRow(row, kept)));
+  const number = { class: "number" };
+  const heads = ["Agrees", "World", "Task", "Policy", ["Seed", number], "Outcome", "Real outcome", ["Probe", number], "Cannot tell", "Play"];
+  showTable("rollouts", heads, rows.map((row) => rolloutRow(row, kept)));
   const of = filter.world ? ` of ${filter.policy} in ${filter.world}, ${filter.task}` : "";
   const what = filter.disagreements ? "outcomes that differ between a world and the real one" : "rollouts, those that differ from the real one first";
   const missing = rows.some((row) => row.episode_id) && rows.every((row) => !row.episode_id || playable.has(row.episode_id)) && !rows.some((row) => kept.has(row.episode_id) || kept.has(row.real_episode_id))
@@ -113,23 +109,20 @@ function showRollouts(total) {
   find("all_rollouts").setAttribute("aria-pressed", String(!filter.disagreements));
 }
 
-async function load(offset) {
-  const asked = filter;
-  const query = new URLSearchParams({ ...filter, limit: PAGE, offset });
-  try {
-    const { rollouts, num_matching } = await get(`${base}/rollouts?${query}`);
-    if (asked !== filter) return;
+function load(offset) {
+  const requested = filter;
+  return attempt(find("rollouts_note"), async () => {
+    const { rollouts, num_matching } = await get(`${base}/rollouts?${new URLSearchParams({ ...filter, limit: PAGE, offset })}`);
+    if (requested !== filter) return;
     rows = offset ? [...rows, ...rollouts] : rollouts;
     showRollouts(num_matching);
     await findPlayable(rollouts);
-    if (asked === filter) showRollouts(num_matching);
-  } catch (error) {
-    say(find("rollouts_note"), error.message, "ERROR");
-  }
+    if (requested === filter) showRollouts(num_matching);
+  });
 }
 
-function open(wanted) {
-  filter = wanted;
+function open(chosen) {
+  filter = chosen;
   find("rollouts_title").scrollIntoView({ block: "start", behavior: "smooth" });
   return load(0);
 }
@@ -149,20 +142,15 @@ async function refresh() {
 }
 
 let newest = "";
-const link = new LiveLink({
-  onTopic: (topic, data) => {
-    if (topic !== "studies") return;
-    const study = data.studies.find((one) => one.name === name);
-    if (!study && data.note) say(find("study_note"), data.note, "ERROR");
-    const now = JSON.stringify(study ?? null);
-    if (now !== newest) {
-      newest = now;
-      refresh();
-    }
-  },
-});
-link.show("studies", true);
-find("only_disagreements").addEventListener("click", () => open({ disagreements: true }));
-find("all_rollouts").addEventListener("click", () => open({}));
-find("more").addEventListener("click", () => load(rows.length));
+function showStudies({ studies, note }) {
+  const study = studies.find((one) => one.name === name);
+  if (!study && note) say(find("study_note"), note, "ERROR");
+  const now = JSON.stringify(study ?? null);
+  if (now === newest) return;
+  newest = now;
+  refresh();
+}
+
+new LiveLink({ topics: { studies: showStudies } });
+onClick({ only_disagreements: () => open({ disagreements: true }), all_rollouts: () => open({}), more: () => load(rows.length) });
 for (const name of ["picture_world", "picture_task"]) find(name).addEventListener("change", showPicture);

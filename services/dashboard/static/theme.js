@@ -1,6 +1,6 @@
 // The theme of every page, kept in this browser: auto (as the system says), light or dark.
 
-import { keep, kept } from "./kept.js";
+import { keep, kept } from "./dom.js";
 
 const ORDER = ["auto", "light", "dark"];
 const { dataset } = document.documentElement;
@@ -8,8 +8,8 @@ const button = document.getElementById("theme");
 const redraws = [];
 let theme = kept("theme");
 
-function apply(wanted) {
-  theme = ORDER.includes(wanted) ? wanted : "auto";
+function apply(name) {
+  theme = ORDER.includes(name) ? name : "auto";
   if (theme === "auto") delete dataset.theme;
   else dataset.theme = theme;
   button.querySelector("#theme_name").textContent = theme;

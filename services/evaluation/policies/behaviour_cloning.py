@@ -64,14 +64,11 @@ class CloningShape(FrozenModel):
 class CloningBatch:
     """Inputs of the network; all images are in −0.5 … 0.5.
 
-    Args:
-        first: [m, 3, h, w], first images of rollouts.
-        rollout: [n], index of the first image of each sample.
-        newest: [n, 3, h/2, w/2], current images at half size.
-        state: [n, 127]: pad features, the reached action with poses in the world, the poses of
-            step 0 in the world, the phase, and whether the reached action was measured.
-        task: [n].
-        slot: [n], number of `SLOT_STEPS` steps since the start.
+    `first` [m, 3, h, w] are first images of rollouts, `rollout` [n] the index of that of each
+    sample, `newest` [n, 3, h/2, w/2] current images at half size. `state` [n, 127] holds pad
+    features, the reached action with poses in the world, the poses of step 0 in the world, the
+    phase, and whether the reached action was measured. `slot` [n] counts `SLOT_STEPS` steps since
+    the start.
     """
 
     first: torch.Tensor
@@ -314,10 +311,7 @@ class BehaviourCloningPolicy:
         return cls(load_checkpoint(path, kind=KIND))
 
     def reset(self, start: PolicyStart) -> None:
-        """Start a new rollout.
-
-        Raises UnknownNameError for a task that the network was not trained for.
-        """
+        """Start a new rollout; raises UnknownNameError for a task that it was not trained for."""
         if start.task not in self.shape.tasks:
             raise UnknownNameError("task of the cloned policy", start.task, list(self.shape.tasks))
         self._start = start
@@ -326,9 +320,8 @@ class BehaviourCloningPolicy:
     def act(self, observation: Observation) -> Float64[np.ndarray, "16 67"]:
         """The next 16 commanded actions, relative to the rollout's step 0.
 
-        Raises:
-            InvalidInputError: `reset` was not called, or images of another size.
-            UnknownNameError: the observation has no head camera.
+        Raises InvalidInputError before `reset` or for images of another size, and UnknownNameError
+        without a head camera.
         """
         if self._start is None:
             raise InvalidInputError("cloned policy: act before reset; call reset with the start")

@@ -150,9 +150,7 @@ def read_cloning_episodes(
 ) -> list[CloningEpisode]:
     """Read the successful robot episodes of some stores, store by store in the order of ids.
 
-    `tasks` and `splits` of scenes are empty for all; the middle square of larger images is scaled
-    to `image_px`. With `imagined`, imagined episodes are read instead of true ones. Raises
-    NotFoundError and ConflictError as `select_episodes`.
+    With `imagined`, imagined episodes are read instead of true ones. Raises as `select_episodes`.
     """
     origins: Collection[Origin] = ("imagined",) if imagined else TRUE_ORIGINS
     readers = select_episodes(
@@ -260,8 +258,7 @@ def train_cloned_policy(
     """The policy trained on successful episodes and, if requested, an early one.
 
     Failed episodes are skipped. The early policy is that after the share `early_at` of the
-    training. Metadata hold the held-out error, that of the mean chunk, and the `command` that
-    repeats the training.
+    training. Metadata hold the held-out error, and that of the mean chunk.
     """
     torch.manual_seed(settings.seed)
     tasks = tuple(sorted({item.task for item in episodes}))
@@ -333,11 +330,7 @@ def _fit_statistics(network: CloningNetwork, learned: Decisions) -> None:
 def _disturbed(
     batch: CloningBatch, network: CloningNetwork, generator: torch.Generator
 ) -> CloningBatch:
-    """Augment with pixel noise, a random brightness per sample, and noise on poses.
-
-    The target stays where it is in the world, so that the policy learns to recover from
-    deviations.
-    """
+    """Augment; the target stays where it is in the world, so that the policy learns to recover."""
     state = batch.state.clone()
     noise = torch.randn((len(state), NUM_POSE_FEATURES), generator=generator)
     network.poses(state).add_(noise * network.pose_scale * _POSE_NOISE)

@@ -1,8 +1,6 @@
 """Colour servo: a policy without learning that reaches for a colour and reacts to touch.
 
-The bundled policy `colour-servo`, and an example of a custom policy: it is independent of the
-scripts and of behaviour cloning, knows the object colours of two tasks and needs five chunks of 16
-steps.
+It knows the object colours of two tasks and needs five chunks of 16 steps.
 """
 
 from dataclasses import dataclass, replace
@@ -40,10 +38,9 @@ _CLOSING_RAD: Final = np.array(
 
 @dataclass(frozen=True)
 class Thing:
-    """Object to reach for.
+    """Object to reach for: its colour, the height of its centre above the table, and the grip.
 
-    Its colour as red, green and blue, the height of its centre above the table, and the point of
-    the right hand that goes there, in the wrist frame.
+    The grip is the point of the right hand that goes there, in the wrist frame.
     """
 
     colour: tuple[float, float, float]
@@ -155,9 +152,7 @@ class ColourServo:
     def act(self, observation: Observation) -> Float64[np.ndarray, "16 67"]:
         """The next 16 commanded actions, relative to the rollout's step 0.
 
-        Raises:
-            InvalidInputError: `reset` was not called.
-            UnknownNameError: the observation has no head camera.
+        Raises InvalidInputError before `reset`, and UnknownNameError without a head camera.
         """
         if self._start is None:
             raise InvalidInputError("colour servo: act before reset; call reset with the start")

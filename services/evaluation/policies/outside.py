@@ -25,11 +25,7 @@ _SOURCE = re.compile(r"(?:(?P<name>[^=]+)=)?(?P<module>[A-Za-z_][\w.]*):(?P<fact
 
 
 def ask(call: Callable[..., Any], *arguments: object, where: str, **keywords: object) -> Any:  # noqa: ANN401 - whatever the policy gives
-    """Call a function of a policy.
-
-    Raises InvalidInputError if it raised; `details["traceback"]` is its own traceback, without
-    frames of the caller.
-    """
+    """Call a function of a policy; InvalidInputError, with its own traceback, if it raised."""
     try:
         return call(*arguments, **keywords)
     except (Exception, SystemExit) as error:  # a policy may raise anything
@@ -51,12 +47,8 @@ def action_chunk(
 ) -> Float64[np.ndarray, "steps 67"]:
     """Validate the return value of a policy's `act` as an action chunk of a world.
 
-    `answer` is an array, nested list or tensor [K, 67] of any kind of real number; `where` names
-    policy, task, seed and chunk in error messages.
-
-    Raises:
-        ShapeError: wrong shape or dtype, or a K that the world does not accept.
-        NonFiniteError: NaN or infinity.
+    `answer` is an array, nested list or tensor [K, 67] of any kind of real number. Raises
+    ShapeError for another shape, dtype or K than the world accepts, NonFiniteError for NaN.
     """
     rows = _array(answer, where)
     if rows.dtype.kind not in "fiu" or rows.ndim != 2 or rows.shape[1] != ACTION_DIM:
@@ -97,10 +89,7 @@ class PolicySource:
 
     @classmethod
     def parse(cls, text: str) -> "PolicySource":
-        """Parse `MODULE:FACTORY` or `NAME=MODULE:FACTORY`.
-
-        Raises InvalidInputError for any other text.
-        """
+        """Parse `MODULE:FACTORY` or `NAME=MODULE:FACTORY`; InvalidInputError for other texts."""
         match = _SOURCE.fullmatch(text)
         if match is None:
             raise InvalidInputError(
@@ -114,11 +103,8 @@ class PolicySource:
     def load(self, arguments: Mapping[str, Any]) -> Policy:
         """Import the module, also from the current directory, and call the factory.
 
-        Raises:
-            NotFoundError: no such module.
-            UnknownNameError: no such factory in the module; its callables are listed.
-            InvalidInputError: the module or the factory raised (with its own traceback), or the
-                policy has no `act`.
+        Raises NotFoundError without such a module, UnknownNameError without such a factory, and
+        InvalidInputError if one of them raised (with its own traceback), or for no `act`.
         """
         where = f"policy {self.name!r}"
         module = self._module(where)
@@ -174,11 +160,9 @@ def load_policies(
 ) -> dict[str, Policy]:
     """Custom policies by name, with the arguments of their factories by name.
 
-    `others` are the names of all policies beside them, which `other_option` gives.
-
-    Raises:
-        InvalidInputError: two policies of one name, or one that does not load.
-        NotFoundError, UnknownNameError: as `PolicySource.load`; also arguments of another policy.
+    `others` are the names of all policies beside them, which `other_option` gives. Raises as
+    `PolicySource.load`, InvalidInputError for two policies of one name, and UnknownNameError for
+    arguments of another policy.
     """
     sources = [PolicySource.parse(text) for text in addresses]
     names = [source.name for source in sources]
@@ -202,10 +186,7 @@ class _WithoutReset:
 
 
 def _loudly(call: Any, *arguments: object, where: str, **keywords: object) -> Any:  # noqa: ANN401
-    """`ask`, with the traceback in the message for the policy's author.
-
-    The cause of the error is the original exception.
-    """
+    """`ask`, with the traceback in the message for the policy's author."""
     try:
         return ask(call, *arguments, where=where, **keywords)
     except InvalidInputError as error:
@@ -215,7 +196,6 @@ def _loudly(call: Any, *arguments: object, where: str, **keywords: object) -> An
 
 
 def _callables(module: ModuleType) -> list[str]:
-    """Functions and classes that a module defines itself."""
     return [
         name
         for name, value in vars(module).items()

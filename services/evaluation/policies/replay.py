@@ -15,9 +15,7 @@ from dextouch.schemas import CHUNK_STEPS, Observation
 class ReplayPolicy:
     """Sends the commanded actions of recorded episodes; as good as their demonstrator.
 
-    Args:
-        actions: commanded actions [T, 67] of steps 1 … T for every (task, seed), relative to the
-            measured poses of step 0.
+    They are [T, 67] of steps 1 … T by task and seed, relative to the measured poses of step 0.
     """
 
     uses_images = False
@@ -33,10 +31,8 @@ class ReplayPolicy:
     def of(cls, episodes: Iterable[EpisodeReader]) -> "ReplayPolicy":
         """Policy that replays these robot episodes; their images are not read.
 
-        Raises:
-            InvalidInputError: an episode without a seed.
-            UnknownNameError: an episode without commanded actions.
-            ConflictError: two episodes have the same task and seed.
+        Raises InvalidInputError for one without a seed, UnknownNameError for one without commanded
+        actions, and ConflictError for two of the same task and seed.
         """
         actions: dict[tuple[str, int], np.ndarray] = {}
         for reader in episodes:
@@ -56,10 +52,7 @@ class ReplayPolicy:
         return cls(actions)
 
     def reset(self, start: PolicyStart) -> None:
-        """Select the episode of this task and seed.
-
-        Raises NotFoundError if there is no such episode.
-        """
+        """Select the episode of this task and seed; raises NotFoundError if there is none."""
         key = (start.task, start.seed)
         if key not in self._actions:
             raise NotFoundError(

@@ -87,13 +87,7 @@ class SubmittedMarkNumber(FrozenModel):
 
 
 def create_rating_app(settings: RatingSettings) -> FastAPI:
-    """Create the application.
-
-    Raises:
-        InvalidInputError: unreadable rubrics, or a store without anything to rate.
-        UnknownNameError: a task without a rubric.
-        StorageError: the marks cannot be opened.
-    """
+    """Create the application; raises as `read_rubrics`, `rubric_of`, `rated_rollouts`, MarkLog."""
     rubrics = read_rubrics(settings.rubrics)
     tasks = settings.tasks or tuple(rubrics)
     for task in tasks:
@@ -225,11 +219,7 @@ def agreement_router(
 
 
 def _rater(request: Request, name: str, key: str) -> str:
-    """Name of the rater; with API keys that of the key, so that nobody can mark for another.
-
-    Raises:
-        ConflictError: another rater than the key's.
-    """
+    """The rater; with API keys they must have the key's name, so that nobody marks for another."""
     if request.app.state.access.has_keys and name != key:
         raise ConflictError(f"rater: got {name!r}, expected {key!r}, the name of this key")
     return name

@@ -7,8 +7,9 @@ from dextouch.episodes import EpisodeStore
 from dextouch.serving import load_settings
 from services.evaluation.rating.marks import MarkLog, read_rubrics
 from services.evaluation.rating.rating_queue import rated_rollouts, state_scores
-from services.evaluation.rating.rating_report import UNDEFINED, rating_report
+from services.evaluation.rating.rating_report import rating_report
 from services.evaluation.settings import RatingReportSettings
+from services.evaluation.templates import rendered
 
 
 def report_main(argv: Sequence[str]) -> int:
@@ -20,20 +21,5 @@ def report_main(argv: Sequence[str]) -> int:
     tasks = {one.episode_id: one.task for one in rollouts}
     report = rating_report(marks, tasks, rubrics, state_scores(store, rollouts, rubrics))
     write_result(settings.json_path, report, allow_nan=False)
-    print(f"{report['num_marks']} marks of {len(report['rollouts'])} rollouts")
-    for task, found in report["tasks"].items():
-        score, alpha, icc = (
-            value if value == UNDEFINED else f"{value:.2f}"
-            for value in (found["score"], found["alpha"], found["icc_2k"])
-        )
-        print(
-            f"{task}: score {score} over {found['num_rollouts']} rollouts, "
-            f"{found['num_raters']} raters, alpha {alpha}, ICC(2,k) {icc}"
-        )
-        print(f"  {found['comment']}")
-        if found["less_state_score"] != UNDEFINED:
-            print(f"  people's scores minus the twin's own: {found['less_state_score']:+.2f}")
-        for row in found["raters"]:
-            low, high = row["bias_interval"]
-            print(f"  {row['rater']}: bias {row['bias']:+.2f} ({low:+.2f} … {high:+.2f})")
+    print(rendered("ratings.txt.j2", report=report), end="")
     return 0

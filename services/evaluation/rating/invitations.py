@@ -81,10 +81,7 @@ class Invitations:
     """Invitations to rate the rollouts of one service, its pool.
 
     They are in the file of marks, which services with other pools may use, too; one process of a
-    service issues and revokes those of its pool.
-
-    Raises:
-        StorageError: the file cannot be used.
+    service issues and revokes those of its pool. Raises StorageError if it cannot be used.
     """
 
     def __init__(self, marks: MarkLog, pool: str) -> None:
@@ -113,8 +110,7 @@ class Invitations:
     def issue(self, rater: str, days: float, *, by: str) -> RaterLink:
         """Invite a rater, whose earlier links to this pool are revoked.
 
-        Raises:
-            ConflictError: the service needs no keys, or one of its keys has the name.
+        Raises ConflictError if the service needs no keys, or one of its keys has the name.
         """
         if not self._access.has_keys:
             raise ConflictError(
@@ -132,8 +128,7 @@ class Invitations:
     def revoke(self, rater: str, *, by: str) -> list[Invitation]:
         """Refuse a rater's links to this pool from the next request on; their marks stay.
 
-        Raises:
-            NotFoundError: the rater has no link that was not revoked.
+        Raises NotFoundError if all are revoked already.
         """
         if not self._change(rater, by):
             raise NotFoundError(f"rater {rater!r}: has no link to revoke")

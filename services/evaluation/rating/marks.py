@@ -114,16 +114,10 @@ def vote(marks: Sequence[Judgement]) -> Vote:
 
 
 class MarkLog:
-    """Append-only store of marks; several processes may use one file.
+    """Append-only store of marks in an SQLite file; several processes may use one file.
 
     A mark given again for the same rater, rollout and presentation corrects the earlier one, which
-    stays in the file.
-
-    Args:
-        path: SQLite file, created with its folder.
-
-    Raises:
-        StorageError: the file cannot be opened, or is not a file of marks.
+    stays in the file. Raises StorageError if it cannot be opened, or is not a file of marks.
     """
 
     def __init__(self, path: Path) -> None:
@@ -132,11 +126,7 @@ class MarkLog:
             connection.executescript(_SCHEMA)
 
     def add(self, mark: Mark) -> int:
-        """Append a mark, durably, and return its number.
-
-        Raises:
-            StorageError: it cannot be written.
-        """
+        """Append a mark, durably, and return its number; StorageError if it cannot be written."""
         row = (
             mark.episode_id,
             mark.rater,
@@ -154,11 +144,7 @@ class MarkLog:
             return int(cursor.lastrowid or 0)
 
     def history(self) -> list[StoredMark]:
-        """All marks ever given, oldest first.
-
-        Raises:
-            StorageError: the file cannot be read.
-        """
+        """All marks ever given, oldest first; StorageError if the file cannot be read."""
         with self.connected("read") as connection:
             rows = connection.execute(
                 "SELECT number, rated_at, content FROM marks ORDER BY number"
@@ -180,8 +166,7 @@ class MarkLog:
     def connected(self, done: str) -> Iterator[sqlite3.Connection]:
         """Connection to the file, durably committed at the end; `done` is what it is for.
 
-        Raises:
-            StorageError: the file cannot be used.
+        Raises StorageError if the file cannot be used.
         """
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
@@ -240,15 +225,10 @@ class Rubric(FrozenModel):
     def score(self, holds: Mapping[str, bool | float], *, is_inconsistent: bool = False) -> float:
         """Score of a rollout in 0 … 1: its points as a share of the maximum.
 
-        Args:
-            holds: whether each criterion holds, for all of them, or with what probability: a
-                criterion is then as probable as the least probable one that it requires.
-            is_inconsistent: whether it shows something physically impossible (once or more: the
-                penalty counts once).
-
-        Raises:
-            UnknownNameError: another rubric's criterion.
-            InvalidInputError: a criterion without a mark.
+        `holds` is whether each criterion holds, or with what probability: a criterion is then as
+        probable as the least probable one that it requires. What is physically impossible costs the
+        penalty once. Raises UnknownNameError for another rubric's criterion, and InvalidInputError
+        if one has no mark.
         """
         names = [criterion.name for criterion in self.criteria]
         for name in holds:
@@ -286,8 +266,7 @@ _RUBRICS: Final = TypeAdapter(dict[str, Rubric])
 def read_rubrics(path: Path | None = None) -> dict[str, Rubric]:
     """Rubrics of a TOML file by task; by default the package's: the paper's and the twin's tasks.
 
-    Raises:
-        InvalidInputError: unreadable, or no valid rubric in a table.
+    Raises InvalidInputError if it is unreadable, or a table holds no valid rubric.
     """
     path = BUNDLED if path is None else path
     try:
@@ -301,11 +280,7 @@ def read_rubrics(path: Path | None = None) -> dict[str, Rubric]:
 
 
 def rubric_of(task: str, rubrics: Mapping[str, Rubric]) -> Rubric:
-    """Rubric of a task.
-
-    Raises:
-        UnknownNameError: no rubric for it.
-    """
+    """Rubric of a task; raises UnknownNameError if it has none."""
     if task not in rubrics:
         raise UnknownNameError("rubric of task", task, list(rubrics))
     return rubrics[task]

@@ -89,11 +89,7 @@ class RatingQueue:
         self._repeat_share = repeat_share
 
     def rollout(self, token: str) -> RatedRollout:
-        """The rollout behind an address.
-
-        Raises:
-            NotFoundError: no rollout of this queue has the token.
-        """
+        """The rollout behind an address; raises NotFoundError if there is none in this queue."""
         if token not in self._rollouts:
             raise NotFoundError(f"rollout {token!r}: not found among those to rate")
         return self._rollouts[token]
@@ -134,8 +130,7 @@ class RatingQueue:
     def check(self, mark: Mark) -> None:
         """Refuse a mark by which a rater would count twice, or decide what is not tied.
 
-        Raises:
-            ConflictError: its presentation is not that of the rater's assignment.
+        Raises ConflictError if its presentation is not that of the rater's assignment.
         """
         latest = (stored.mark for stored in self._marks.latest().values())
         given = [one for one in latest if one.episode_id == mark.episode_id]
@@ -178,8 +173,7 @@ def rated_rollouts(
 ) -> list[RatedRollout]:
     """Rollouts of some tasks that have head images, of one study or all; takes of people are none.
 
-    Raises:
-        InvalidInputError: nothing to rate.
+    Raises InvalidInputError if there is nothing to rate.
     """
     found = []
     for episode_id in store.list():
@@ -215,7 +209,6 @@ def _is_rated(about: EpisodeAttributes) -> bool:
 
 
 def _studies(about: EpisodeAttributes) -> set[str]:
-    """Names of the studies whose rollout an episode is."""
     return {entry.id.partition(": ")[0] for entry in about.lineage if entry.kind == "rollout"}
 
 
@@ -251,11 +244,7 @@ class RolloutPictures:
         self._opened = lru_cache(maxsize=16)(store.open)
 
     def step(self, episode_id: str, step: int) -> bytes:
-        """JPEG of one step; where it has no image, of the nearest one.
-
-        Raises:
-            NotFoundError: no such step.
-        """
+        """JPEG of one step, or of the nearest one with an image; NotFoundError for no such step."""
         episode = self._opened(episode_id)
         if not 0 <= step < episode.num_steps:
             raise NotFoundError(

@@ -29,12 +29,10 @@ from services.evaluation.statistics import (
     central_interval,
     start_counts,
 )
+from services.evaluation.templates import UNDEFINED
 
 Level = Literal["nominal", "interval"]
 LEAST_ALPHA: Final = 0.667
-UNDEFINED = "undefined"
-# Of a rollout without marks of people.
-_UNDECIDED: Final[dict[str, Any]] = {"decided_score": UNDEFINED, "tied": [], "was_tied": False}
 
 
 @dataclass(frozen=True)
@@ -54,13 +52,8 @@ def krippendorff_alpha(ratings: Float64[np.ndarray, "_ _"], *, level: Level) -> 
     "Computing Krippendorff's Alpha-Reliability", 2011). Rollouts with fewer than two ratings do not
     count.
 
-    Args:
-        ratings: [rollouts, raters], NaN where missing.
-        level: "nominal" for marks that are equal or not; "interval" for scores, whose squared
-            difference counts.
-
-    Returns:
-        Alpha; NaN where it is undefined: no rollout with two ratings, or all ratings equal.
+    The level is "nominal" for marks that are equal or not, "interval" for scores, whose squared
+    difference counts. NaN where it is undefined: no rollout with two ratings, or all equal.
     """
     known = np.isfinite(ratings)
     rows = known.sum(axis=1) >= 2
@@ -82,11 +75,6 @@ def alpha_interval(
     """95 % bootstrap interval of alpha of scores: rollouts are drawn, with all of their ratings.
 
     None if alpha is undefined, or is in more than one of twenty draws, as for very few rollouts.
-
-    Args:
-        ratings: [rollouts, raters], NaN where missing.
-        generator: random numbers of the draws.
-        num_draws: how many.
     """
     rated = ratings[np.isfinite(ratings).sum(axis=1) >= 2]
     if len(rated) < 2:
@@ -117,13 +105,7 @@ def intraclass_correlation(ratings: Float64[np.ndarray, "_ _"]) -> float:
     """ICC(2,k): reliability of the mean of all raters, each of whom rated every rollout.
 
     Two-way random effects, absolute agreement (Shrout and Fleiss 1979). Rollouts that a rater did
-    not rate do not count.
-
-    Args:
-        ratings: [rollouts, raters], NaN where missing.
-
-    Returns:
-        The coefficient; NaN for fewer than two raters or two complete rollouts, or without spread.
+    not rate do not count. NaN for fewer than two raters or complete rollouts, or without spread.
     """
     complete = ratings[np.isfinite(ratings).all(axis=1)]
     num_rollouts, num_raters = complete.shape
@@ -152,10 +134,10 @@ def rater_biases(
         shared = known[:, column] & np.isfinite(others).any(axis=1)
         if not shared.any():
             continue
-        apart = ratings[shared, column] - np.nanmean(others[shared], axis=1)
-        counts = start_counts(len(apart), generator, num_draws=1000)
-        interval = central_interval(counts @ apart / len(apart))
-        found.append(RaterBias(rater, float(apart.mean()), interval, len(apart)))
+        differences = ratings[shared, column] - np.nanmean(others[shared], axis=1)
+        counts = start_counts(len(differences), generator, num_draws=1000)
+        interval = central_interval(counts @ differences / len(differences))
+        found.append(RaterBias(rater, float(differences.mean()), interval, len(differences)))
     return found
 
 
@@ -169,95 +151,69 @@ def rating_report(
 ) -> dict[str, Any]:
     """Report entries: scores by rollout, and by task alpha, ICC(2,k), biases and consistency.
 
-    Marks of programs are listed separately from those of people.
-
-    Args:
-        marks: those that count (`MarkLog.latest`).
-        task_of: task of each episode id; marks of others are skipped.
-        rubrics: by task.
-        state_scores: true scores by episode id, where they are known.
-        raters_per_rollout: of fewer nothing is tied yet.
+    Of the marks that count (`MarkLog.latest`), those of programs are listed separately, and those
+    of episodes without a task are skipped. `state_scores` are true scores by episode id, where they
+    are known; with fewer than `raters_per_rollout` marks nothing is tied yet.
     """
     known = [one.mark for one in marks if one.mark.episode_id in task_of]
-    decided = _decided(known, task_of, rubrics, raters_per_rollout)
-    tasks = sorted({task_of[mark.episode_id] for mark in known})
-    rollouts = [
-        row
-        | decided.get(row["episode_id"], _UNDECIDED)
-        | {"state_score": state_scores.get(row["episode_id"], UNDEFINED)}
-        for row in _rollouts(known, task_of, rubrics)
+    by_episode: dict[str, list[Mark]] = defaultdict(list)
+    for mark in known:
+        by_episode[mark.episode_id].append(mark)
+    rows = [
+        {"episode_id": name, "task": task_of[name]}
+        | _rollout(given, rubric_of(task_of[name], rubrics), raters_per_rollout)
+        | {"state_score": state_scores.get(name, UNDEFINED)}
+        for name, given in sorted(by_episode.items())
     ]
     return {
-        "rollouts": rollouts,
+        "rollouts": [row for row in rows if row["human_scores"] or row["auto_scores"]],
         "tasks": {
             task: _task(
                 [mark for mark in known if task_of[mark.episode_id] == task],
                 rubric_of(task, rubrics),
             )
-            | _conflicts([one for name, one in decided.items() if task_of[name] == task])
-            | {"less_state_score": _less_state([r for r in rollouts if r["task"] == task])}
-            for task in tasks
+            | _majorities([row for row in rows if row["task"] == task])
+            for task in sorted({row["task"] for row in rows})
         },
         "cannot_judge": sum(mark.cannot_judge for mark in known),
         "num_marks": len(known),
     }
 
 
-def _rollouts(
-    marks: list[Mark], task_of: Mapping[str, str], rubrics: Mapping[str, Rubric]
-) -> list[dict[str, Any]]:
-    found: dict[str, dict[str, list[float]]] = defaultdict(lambda: {"human": [], "auto": []})
-    for mark in marks:
-        if mark.presentation == FIRST and not mark.cannot_judge:
-            rubric = rubric_of(task_of[mark.episode_id], rubrics)
-            found[mark.episode_id][mark.kind].append(_score(mark, rubric))
-    return [
-        {"episode_id": episode_id, "task": task_of[episode_id]}
-        | {f"{kind}_scores": scores for kind, scores in kinds.items()}
-        | {"score": float(np.mean(kinds["human"])) if kinds["human"] else UNDEFINED}
-        for episode_id, kinds in sorted(found.items())
-    ]
-
-
-def _decided(
-    marks: list[Mark],
-    task_of: Mapping[str, str],
-    rubrics: Mapping[str, Rubric],
-    raters_per_rollout: int,
-) -> dict[str, dict[str, Any]]:
-    """Of each rollout with marks of people the score of their majority, and what is tied."""
-    found: dict[str, dict[str, Any]] = {}
-    for episode_id, given in by_people(marks).items():
-        most = vote(given)
-        score: float | str = UNDEFINED
-        if most.holds and not most.tied:
-            rubric = rubric_of(task_of[episode_id], rubrics)
-            score = rubric.score(most.holds, is_inconsistent=most.is_inconsistent)
-        first = [mark for mark in given if mark.presentation == FIRST]
-        is_complete = len(first) >= raters_per_rollout
-        was_tied = is_complete and bool(vote(first).tied) and len(given) > 1
-        tied = list(most.tied) if is_complete else []
-        found[episode_id] = {"decided_score": score, "tied": tied, "was_tied": was_tied}
-    return found
-
-
-def _conflicts(decided: list[dict[str, Any]]) -> dict[str, Any]:
-    """Ties among the raters of a task's rollouts, and the mean score of the majorities."""
-    scores = [one["decided_score"] for one in decided if one["decided_score"] != UNDEFINED]
-    num_tied = sum(bool(one["tied"]) for one in decided)
-    num_settled = sum(one["was_tied"] and not one["tied"] for one in decided)
-    return {
-        "conflicts": {"open": num_tied, "settled": num_settled},
-        "decided_score": float(np.mean(scores)) if scores else UNDEFINED,
+def _rollout(marks: list[Mark], rubric: Rubric, raters_per_rollout: int) -> dict[str, Any]:
+    """Scores of one rollout, that of the majority of people, and what they are tied on."""
+    judged = [mark for mark in marks if mark.presentation == FIRST and not mark.cannot_judge]
+    scores = {
+        kind: [_score(mark, rubric) for mark in judged if mark.kind == kind]
+        for kind in ("human", "auto")
+    }
+    given = [mark for people in by_people(marks).values() for mark in people]
+    first = [mark for mark in given if mark.presentation == FIRST]
+    most, is_complete = vote(given), len(first) >= raters_per_rollout
+    decided: float | str = UNDEFINED
+    if most.holds and not most.tied:
+        decided = rubric.score(most.holds, is_inconsistent=most.is_inconsistent)
+    return {f"{kind}_scores": found for kind, found in scores.items()} | {
+        "score": float(np.mean(scores["human"])) if scores["human"] else UNDEFINED,
+        "decided_score": decided,
+        "tied": list(most.tied) if is_complete else [],
+        "was_tied": is_complete and bool(vote(first).tied) and len(given) > 1,
     }
 
 
-def _less_state(rollouts: list[dict[str, Any]]) -> float | str:
-    """Mean of people's scores minus the ground truth, over the rollouts that have both."""
-    both = [row for row in rollouts if UNDEFINED not in {row["score"], row["state_score"]}]
-    if not both:
-        return UNDEFINED
-    return float(np.mean([row["score"] - row["state_score"] for row in both]))
+def _majorities(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Of a task's rollouts: ties, mean score of majorities, and people's minus the true score."""
+    decided = [row["decided_score"] for row in rows if row["decided_score"] != UNDEFINED]
+    both = [row for row in rows if UNDEFINED not in {row["score"], row["state_score"]}]
+    differences = [row["score"] - row["state_score"] for row in both]
+    return {
+        "conflicts": {
+            "open": sum(bool(row["tied"]) for row in rows),
+            "settled": sum(row["was_tied"] and not row["tied"] for row in rows),
+        },
+        "decided_score": float(np.mean(decided)) if decided else UNDEFINED,
+        "less_state_score": float(np.mean(differences)) if differences else UNDEFINED,
+    }
 
 
 def _score(mark: Mark, rubric: Rubric) -> float:

@@ -13,82 +13,53 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
-
 from dextouch import __version__
 from dextouch.free_text import printable
 from services.evaluation.reporting.pictures import (
     FULL_SCALE_KPA,
     MAX_MOVING,
-    ActionPicture,
-    EpisodePicture,
-    PredictionPicture,
     ReportPictures,
     action_charts,
-    action_picture,
     clock_chart,
-    episode_pair,
-    episode_picture,
+    moments,
     moving_picture,
     policy_panels,
     scale_colours,
-    strips,
 )
 from services.evaluation.reporting.sections import (
-    calibration_rows,
+    AGREEMENT,
+    ERRORS,
     clock_rows,
     comparison_bars,
     error_rows,
     failure_rows,
-    figure,
-    stage_bars,
     tiles,
     undecided_note,
 )
-
-__all__ = [
-    "MAX_MOVING",
-    "ActionPicture",
-    "EpisodePicture",
-    "PredictionPicture",
-    "ReportPictures",
-    "action_picture",
-    "episode_pair",
-    "episode_picture",
-    "write_report",
-]
+from services.evaluation.templates import environment
 
 
 def write_report(report: Mapping[str, Any], pictures: ReportPictures, path: Path) -> None:
     """Write the page atomically; NaN and None are shown as "undefined"."""
-    environment = Environment(
-        loader=PackageLoader("services.evaluation.reporting"),
-        autoescape=select_autoescape(["j2"], default=True),
-        undefined=StrictUndefined,
-        finalize=_visible,
-        trim_blocks=True,
-        lstrip_blocks=True,
+    # Texts from elsewhere with their unusual characters escaped; drawings and numbers as given.
+    pages = environment().overlay(
+        finalize=lambda value: printable(value, lines=True) if type(value) is str else value
     )
-    environment.filters["figure"] = figure
-    text = environment.get_template("report.html.j2").render(
-        title=report.get("title", "DexTouch report"),
-        about=report.get("about", {}),
+    text = pages.get_template("report.html.j2").render(
         raw_report=report,
         tiles=tiles(report),
-        stages=stage_bars(report.get("stages", [])),
         errors=error_rows(report.get("errors", {})),
-        calibrations=calibration_rows(report),
+        error_kinds=ERRORS,
         clocks=clock_rows(report.get("errors", {})),
         clock_chart=clock_chart(pictures),
         action_charts=action_charts(pictures.actions),
         comparisons=comparison_bars(report.get("world_model", {})),
-        prediction=report.get("prediction"),
         policies=policy_panels(report),
-        agreement=report.get("agreement", {}),
+        agreement_names=AGREEMENT,
         failures=failure_rows(report),
         undecided_note=undecided_note,
-        num_rollouts=report.get("num_rollouts", 0),
-        strips=strips(pictures),
+        pictures=pictures,
+        moments=moments,
         moving=[moving_picture(pair) for pair in pictures.moving[:MAX_MOVING]],
         scale=scale_colours(),
         full_scale_kpa=FULL_SCALE_KPA,
@@ -102,8 +73,3 @@ def write_report(report: Mapping[str, Any], pictures: ReportPictures, path: Path
     unfinished = path.with_suffix(".unfinished")
     unfinished.write_text(text, encoding="utf-8")
     unfinished.replace(path)
-
-
-def _visible(value: object) -> object:
-    """Texts from elsewhere with their unusual characters escaped; drawings and numbers as given."""
-    return printable(value, lines=True) if type(value) is str else value

@@ -5,12 +5,12 @@ import io
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, Final
 
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
-from markupsafe import Markup, escape
+from markupsafe import Markup
 from PIL import Image, ImageDraw
 
 from dextouch.episodes import EpisodeReader
@@ -27,7 +27,7 @@ from dextouch.tactile.layout import (
     TactileLayout,
 )
 from services.evaluation.reporting.policy_picture import NAMESPACE, Rate, policy_picture
-from services.evaluation.reporting.sections import AgreementFigure, agreement_figures, is_number
+from services.evaluation.templates import is_number, rendered
 
 # Photographs larger than this are embedded as JPEG.
 MAX_PNG_SIDE_PX = 256
@@ -236,7 +236,6 @@ def _webp(frames: Sequence[Image.Image], quality: int, duration_ms: int) -> byte
 
 
 def _frame(pair: PredictionPicture, index: int, progress: float) -> Image.Image:
-    """Images above hands, real beside imagined, and how much of the time has passed."""
     worlds = (
         (pair.true_images, pair.true_tactile_kpa),
         (pair.predicted_images, pair.predicted_tactile_kpa),
@@ -270,23 +269,6 @@ class Line:
     dashed: bool = False
 
 
-@dataclass(frozen=True)
-class _Axes:
-    """Scaling from data to picture coordinates."""
-
-    x: tuple[float, float]
-    y: tuple[float, float]
-    width: int
-    height: int
-
-    def to_px(self, x: float, y: float) -> tuple[float, float]:
-        right, bottom = self.width - _RIGHT, self.height - _BOTTOM
-        return (
-            _LEFT + (x - self.x[0]) / (self.x[1] - self.x[0]) * (right - _LEFT),
-            bottom - (y - self.y[0]) / (self.y[1] - self.y[0]) * (bottom - _TOP),
-        )
-
-
 def ticks(low: float, high: float) -> list[float]:
     """Round numbers in low … high, roughly five of them."""
     step = 10.0 ** math.floor(math.log10((high - low) / 5))
@@ -300,49 +282,47 @@ def ticks(low: float, high: float) -> list[float]:
 
 def line_chart(lines: Sequence[Line], *, x_label: str, y_label: str) -> Markup:
     """Curves over a common axis; long ones are decimated to at most 600 points each."""
-    x = np.concatenate([line.x for line in lines])
-    y = np.concatenate([line.y for line in lines])
-    axes = _Axes(_range(x, margin=0.0), _range(y, margin=0.06), _WIDTH, _HEIGHT)
-    body = [_grid(axes, x_label, y_label)]
+    to_px, labels = [], []
+    for axis, margin, (first_px, last_px) in (
+        ("x", 0.0, (_LEFT, _WIDTH - _RIGHT)),
+        ("y", 0.06, (_HEIGHT - _BOTTOM, _TOP)),
+    ):
+        low, high = _range(np.concatenate([getattr(one, axis) for one in lines]), margin=margin)
+        scale = partial(_scaled, first=low, last=high, first_px=first_px, last_px=last_px)
+        to_px.append(scale)
+        labels.append([(value, scale(value)) for value in ticks(low, high)])
+    curves = []
     for line in lines:
-        stride = max(1, -(-len(line.x) // MAX_POINTS))
-        points = " ".join(
-            "{:.1f},{:.1f}".format(*axes.to_px(float(a), float(b)))
-            for a, b in zip(line.x[::stride], line.y[::stride], strict=True)
-        )
-        dash = ' stroke-dasharray="4 3"' if line.dashed else ""
-        body.append(
-            f'<polyline class="curve s{line.style % NUM_STYLES}"{dash} points="{points}">'
-            f"<title>{escape(line.label)}</title></polyline>"
-        )
-    return _svg(body, axes, f"{y_label} over {x_label}")
+        kept = slice(None, None, max(1, -(-len(line.x) // MAX_POINTS)))
+        pairs = zip(to_px[0](line.x[kept]), to_px[1](line.y[kept]), strict=True)
+        curves.append((line, " ".join("{:.1f},{:.1f}".format(*pair) for pair in pairs)))
+    return _drawn(
+        "lines.svg.j2",
+        curves=curves,
+        x_label=x_label,
+        y_label=y_label,
+        x_ticks=labels[0],
+        y_ticks=labels[1],
+        right=_WIDTH - _RIGHT,
+        top=_TOP,
+        bottom=_HEIGHT - _BOTTOM,
+    )
 
 
 def stand_alone(charts: Sequence[Markup], keys: Mapping[str, int]) -> str:
     """One SVG file of line charts side by side, with its own colours and a key of styles."""
-    total, total_height = _WIDTH * len(charts), _HEIGHT + _KEY_PX
-    style = (
-        ".grid{stroke:#e4e5e0}.axis{stroke:#6a7280}text{fill:#4b5563;font:11px sans-serif}"
-        ".curve{fill:none;stroke-width:1.6;stroke-linejoin:round}"
-    )
-    style += "".join(f".curve.s{k}{{stroke:{colour}}}" for k, colour in enumerate(_PALETTE))
-    body: list[str] = [
-        str(chart).replace(
-            "<svg ", f'<svg x="{k * _WIDTH}" width="{_WIDTH}" height="{_HEIGHT}" ', 1
-        )
-        for k, chart in enumerate(charts)
-    ]
-    for k, (label, chosen) in enumerate(keys.items()):
-        x, y = _LEFT + k * (total - _LEFT) // len(keys), _HEIGHT + _KEY_PX // 2
-        body.append(
-            f'<path class="curve s{chosen % NUM_STYLES}" d="M{x} {y}h20"/>'
-            f'<text x="{x + 26}" y="{y + 4}">{escape(label)}</text>'
-        )
-    return (
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {total} {total_height}" '
-        f'width="{total}" height="{total_height}"><style>{style}</style>'
-        f'<rect width="100%" height="100%" fill="white"/>{"".join(body)}</svg>\n'
-    )
+    style = {"palette": _PALETTE, "key_px": _KEY_PX}
+    return f"{_drawn('stand_alone.svg.j2', charts=charts, keys=keys, **style)}\n"
+
+
+def _drawn(template: str, **values: object) -> Markup:
+    size = {"width": _WIDTH, "height": _HEIGHT, "left": _LEFT, "num_styles": NUM_STYLES}
+    # The template escapes labels; the rest are numbers of this module.
+    return Markup(rendered(template, **size, **values))  # noqa: S704
+
+
+def _scaled(value: Any, *, first: float, last: float, first_px: int, last_px: int) -> Any:  # noqa: ANN401 - a number or an array
+    return first_px + (value - first) / (last - first) * (last_px - first_px)
 
 
 def _range(values: np.ndarray, *, margin: float) -> tuple[float, float]:
@@ -354,41 +334,6 @@ def _range(values: np.ndarray, *, margin: float) -> tuple[float, float]:
     return low - room, high + room
 
 
-def _grid(axes: _Axes, x_label: str, y_label: str) -> str:
-    right, bottom = axes.width - _RIGHT, axes.height - _BOTTOM
-    parts = []
-    for value in ticks(*axes.y):
-        _, y = axes.to_px(axes.x[0], value)
-        parts.append(
-            f'<path class="grid" d="M{_LEFT} {y:.1f}H{right}"/>'
-            f'<text class="tick" x="{_LEFT - 6}" y="{y + 3.5:.1f}" text-anchor="end">'
-            f"{value:.4g}</text>"
-        )
-    for value in ticks(*axes.x):
-        x, _ = axes.to_px(value, axes.y[0])
-        parts.append(
-            f'<text class="tick" x="{x:.1f}" y="{bottom + 15}" text-anchor="middle">'
-            f"{value:.4g}</text>"
-        )
-    middle_x, middle_y = (_LEFT + right) / 2, (_TOP + bottom) / 2
-    parts.append(
-        f'<path class="axis" d="M{_LEFT} {bottom}H{right}"/>'
-        f'<text class="label" x="{middle_x:.0f}" y="{axes.height - 4}" text-anchor="middle">'
-        f"{escape(x_label)}</text>"
-        f'<text class="label" transform="translate(12 {middle_y:.0f}) rotate(-90)" '
-        f'text-anchor="middle">{escape(y_label)}</text>'
-    )
-    return "".join(parts)
-
-
-def _svg(body: Sequence[str], axes: _Axes, title: str) -> Markup:
-    # Every label is escaped; the rest are numbers of this module.
-    return Markup(  # noqa: S704
-        f'<svg class="chart" viewBox="0 0 {axes.width} {axes.height}" role="img" '
-        f'aria-label="{escape(title)}">{"".join(body)}</svg>'
-    )
-
-
 @dataclass(frozen=True)
 class NamedChart:
     """A chart with its title and legend."""
@@ -396,27 +341,6 @@ class NamedChart:
     title: str
     svg: Markup
     names: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class PolicyPanel:
-    """Policies, agreement, comments and chart of one task."""
-
-    task: str
-    rows: list[Mapping[str, Any]]
-    agreement: list[AgreementFigure]
-    comments: list[str]
-    chart: Markup | None
-    rubric: Mapping[str, Any]
-
-
-@dataclass(frozen=True)
-class Strip:
-    """Images in rows over time: an episode, or ground truth above prediction."""
-
-    title: str
-    kind: str
-    rows: list[tuple[str, list[Moment]]]
 
 
 def clock_chart(pictures: ReportPictures) -> NamedChart | None:
@@ -468,11 +392,10 @@ def _lines(
     ]
 
 
-def policy_panels(report: Mapping[str, Any]) -> list[PolicyPanel]:
+def policy_panels(report: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Scores of the policies and agreement of the worlds, one panel per task."""
     entries = report.get("policies", [])
-    agreement, comments = report.get("agreement", {}), report.get("comments", {})
-    panels = []
+    panels = list[dict[str, Any]]()
     for task in dict.fromkeys(str(e["task"]) for e in entries):
         rows = [e for e in entries if e["task"] == task]
         pairs = {
@@ -486,29 +409,23 @@ def policy_panels(report: Mapping[str, Any]) -> list[PolicyPanel]:
         drawn = policy_picture(pairs, title, "svg").decode() if pairs else ""
         # Names are escaped, the rest are numbers; within a page a picture needs no namespace.
         chart = Markup(drawn.replace(f" {NAMESPACE}", "")) if drawn else None  # noqa: S704
-        figures = agreement_figures(agreement.get(task, {}))
-        rubric = report.get("rubrics", {}).get(report.get("imagined_world"), {}).get(task, {})
-        panels.append(PolicyPanel(task, rows, figures, comments.get(task, []), chart, rubric))
+        world = report.get("imagined_world")
+        panels.append(
+            {
+                "task": task,
+                "rows": rows,
+                "agreement": report.get("agreement", {}).get(task, {}),
+                "comments": report.get("comments", {}).get(task, []),
+                "chart": chart,
+                "rubric": report.get("rubrics", {}).get(world, {}).get(task, {}),
+            }
+        )
     return panels
 
 
 def _rate(entry: Mapping[str, Any], world: str) -> Rate:
-    """A score with its interval, or the score itself if the report has none."""
     low, high = entry.get(f"{world}_interval") or (entry[world], entry[world])
     return float(entry[world]), float(low), float(high)
-
-
-def strips(pictures: ReportPictures) -> list[Strip]:
-    """Episodes as one row of images, predictions below their ground truth."""
-    found = [
-        Strip(e.title, "episode", [("", moments(e.times_s, e.images, e.tactile_kpa, e.layout))])
-        for e in pictures.episodes
-    ]
-    for p in pictures.predictions:
-        true = moments(p.times_s, p.true_images, p.true_tactile_kpa, p.layout)
-        predicted = moments(p.times_s, p.predicted_images, p.predicted_tactile_kpa, p.layout)
-        found.append(Strip(p.title, "prediction", [("true", true), ("predicted", predicted)]))
-    return found
 
 
 def episode_picture(reader: EpisodeReader, *, num_moments: int = 8) -> EpisodePicture:

@@ -2,13 +2,12 @@
 
 import io
 from collections.abc import Mapping, Sequence
-from html import escape
 from math import cos, pi, sin
 from typing import Final, Literal, NamedTuple
 
 from PIL import Image, ImageDraw, ImageFont
 
-from services.evaluation.reporting.sections import escape as latex
+from services.evaluation.templates import rendered
 
 Format = Literal["svg", "png", "tex"]
 # A success rate with the ends of its interval.
@@ -46,10 +45,18 @@ class _Shape(NamedTuple):
 def policy_picture(pairs: Pairs, title: str, form: Format) -> bytes:
     """The picture in one format; policies without rates get neither a mark nor a name."""
     if form == "tex":
-        return _latex(pairs, title).encode()
+        styles = {
+            name: (list(MARKS)[k % len(MARKS)], tuple(bytes.fromhex(COLOURS[k % len(COLOURS)][1:])))
+            for k, name in enumerate(pairs)
+        }
+        return rendered("policies.tex.j2", pairs=pairs, title=title, styles=styles).encode()
     shapes = _shapes(pairs, title)
     height = round(TOP + SIDE + 34 + ROW * sum(map(bool, pairs.values())))
-    return _svg(shapes, height).encode() if form == "svg" else _png(shapes, height)
+    if form == "png":
+        return _png(shapes, height)
+    size = {"width": WIDTH, "height": height}
+    drawn = rendered("policies.svg.j2", shapes=shapes, shades=SHADES, ink=INK, **size)
+    return drawn.encode()
 
 
 def _shapes(pairs: Pairs, title: str) -> list[_Shape]:
@@ -92,28 +99,6 @@ def _corners(index: int, x: float, y: float) -> list[tuple[float, float]]:
     return [(x + radius * cos(turn), y + radius * sin(turn)) for turn in turns]
 
 
-def _svg(shapes: Sequence[_Shape], height: int) -> str:
-    parts = []
-    for points, colour, width, text, anchor in shapes:
-        # Ink takes the colour of a page that shows the picture.
-        paint = f'currentColor" opacity="{SHADES[colour]:g}"' if colour in SHADES else f'{colour}"'
-        (x, y), corners = points[0], " ".join(f"{x:.2f},{y:.2f}" for x, y in points)
-        if text:
-            parts.append(
-                f'<text x="{x:g}" y="{y:g}" font-size="{width:g}" text-anchor="{anchor}" '
-                f'fill="{paint}>{escape(text)}</text>'
-            )
-        elif width:
-            parts.append(f'<path d="M{corners}" stroke-width="{width:g}" stroke="{paint}/>')
-        else:
-            parts.append(f'<polygon points="{corners}" fill="{paint}/>')
-    return (
-        f'<svg {NAMESPACE} viewBox="0 0 {WIDTH} {height}" fill="none" '
-        f'width="{WIDTH}pt" height="{height}pt" color="{INK}" font-family="sans-serif">'
-        f'<rect class="paper" width="100%" height="100%" fill="#fff"/>{"".join(parts)}</svg>\n'
-    )
-
-
 def _png(shapes: Sequence[_Shape], height: int) -> bytes:
     scale = DOTS * OVERSAMPLING
     sheet = Image.new("RGB", (round(WIDTH * scale), round(height * scale)), "white")
@@ -132,34 +117,3 @@ def _png(shapes: Sequence[_Shape], height: int) -> bytes:
     smaller = sheet.resize((round(WIDTH * DOTS), round(height * DOTS)), Image.Resampling.LANCZOS)
     smaller.save(made, "PNG", dpi=(300, 300))
     return made.getvalue()
-
-
-def _latex(pairs: Pairs, title: str) -> str:
-    lines = [
-        r"% Needs \usepackage{pgfplots} and \pgfplotsset{compat=1.16}.",
-        r"\begin{tikzpicture}",
-        rf"\begin{{axis}}[title={{{latex(title)}}}, xlabel={{real success}},",
-        r"  ylabel={imagined success}, xmin=-0.04, xmax=1.04, ymin=-0.04, ymax=1.04,",
-        r"  width=\linewidth, axis equal image, grid=major, xtick distance=0.25,",
-        # Below the axes: beside them, long names would be wider than the line.
-        r"  ytick distance=0.25, legend cell align=left,",
-        r"  legend style={draw=none, at={(0, -0.18)}, anchor=north west}]",
-        r"\addplot[gray, forget plot] coordinates {(0, 0) (1, 1)};",
-    ]
-    for index, (name, found) in enumerate(pairs.items()):
-        if not found:
-            continue
-        colour, mark = COLOURS[index % len(COLOURS)], list(MARKS)[index % len(MARKS)]
-        red, green, blue = bytes.fromhex(colour[1:])
-        lines += [
-            rf"\addplot[only marks, mark={mark}, "
-            rf"color={{rgb,255:red,{red};green,{green};blue,{blue}}}, error bars/.cd,",
-            r"  x dir=both, x explicit, y dir=both, y explicit] coordinates {",
-        ]
-        for (x, x_low, x_high), (y, y_low, y_high) in found:
-            lines.append(
-                f"  ({x:.4f}, {y:.4f}) += ({x_high - x:.4f}, {y_high - y:.4f}) "
-                f"-= ({x - x_low:.4f}, {y - y_low:.4f})"
-            )
-        lines.append(rf"}}; \addlegendentry{{{latex(name)}}}")
-    return "\n".join([*lines, r"\end{axis}", r"\end{tikzpicture}", ""])

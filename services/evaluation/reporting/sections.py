@@ -1,11 +1,12 @@
-"""Sections of the report page: tiles, bars and error rows."""
+"""Sections of the report page: tiles, bars and error rows; tables for papers."""
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
-from services.evaluation.scores import REAL, UNDEFINED, ClosedLoopReport
+from services.evaluation.scores import REAL, ClosedLoopReport
+from services.evaluation.templates import UNDEFINED, escape_latex, figure, is_number, rendered
 
 # Key of the figure, its name on the page, its unit, and its bound, if any.
 ERRORS: tuple[tuple[str, str, str, tuple[str, float] | None], ...] = (
@@ -16,8 +17,6 @@ ERRORS: tuple[tuple[str, str, str, tuple[str, float] | None], ...] = (
     ("fingertip_error_mm", "Fingertip error", "mm", None),
 )
 CLOCK_BOUND_MS = 1.0
-# Smaller errors with measured and true calibration are not told apart.
-LEAST_SHOWN = 0.001
 AGREEMENT: tuple[tuple[str, str], ...] = (
     ("pearson", "Pearson"),
     ("mmrv", "MMRV, ties counted"),
@@ -48,12 +47,7 @@ COMPARISONS: tuple[tuple[str, str, str, str, str, tuple[str, ...]], ...] = (
      ("zero", *_OF_CONTACT)),
     ("Contact, F1", "", "more is better", "contact_f1", "touch", _OF_CONTACT),
 )  # fmt: skip
-_ESCAPED: Final = {letter: rf"\{letter}" for letter in "#$%&_{}"} | {
-    "\\": r"\textbackslash{}",
-    "~": r"\textasciitilde{}",
-    "^": r"\textasciicircum{}",
-}
-_FIGURES: Final = (("pearson", "Pearson"), ("mmrv", "MMRV"), ("mmrv_paper", "MMRV (paper)"))
+_FIGURES: Final = {"pearson": "Pearson", "mmrv": "MMRV", "mmrv_paper": "MMRV (paper)"}
 
 
 @dataclass(frozen=True)
@@ -88,25 +82,6 @@ class ErrorRow:
 
 
 @dataclass(frozen=True)
-class CalibrationRow:
-    """One error of a take with the measured and with the true calibration of its devices."""
-
-    name: str
-    measured: str
-    true: str
-    unit: str
-
-
-@dataclass(frozen=True)
-class AgreementFigure:
-    """One agreement figure, with its 95 % interval if it has one."""
-
-    name: str
-    value: Any
-    interval: tuple[float, float] | None
-
-
-@dataclass(frozen=True)
 class Tile:
     """One headline figure."""
 
@@ -127,25 +102,6 @@ class FailureRow:
     count: int = 1
 
 
-def is_number(value: object) -> bool:
-    """Whether a value is a finite number."""
-    return isinstance(value, int | float) and math.isfinite(value)
-
-
-def figure(value: object, digits: int = 3) -> str:
-    """Format a figure with three significant digits; non-finite values are "undefined".
-
-    The reason of an undefined figure stays: "undefined (2 policies)".
-    """
-    if not is_number(value):
-        return value if isinstance(value, str) and value.startswith(UNDEFINED) else UNDEFINED
-    number = float(str(value))
-    if number != 0 and not 1e-3 <= abs(number) < 1e5:
-        return f"{number:.{digits - 1}e}"
-    decimals = digits - 1 - math.floor(math.log10(abs(number))) if number else 1
-    return f"{number:.{max(0, min(decimals, 4))}f}"
-
-
 def undecided_note(row: Mapping[str, Any], name: str) -> str:
     """What to write beside a policy's rate of this name; empty if all rollouts were decided."""
     undecided = row.get(f"{name}_undecided", 0)
@@ -153,14 +109,6 @@ def undecided_note(row: Mapping[str, Any], name: str) -> str:
         return ""
     note = f"{undecided} of {row[f'{name}_rollouts']} cannot tell"
     return note if row[f"{name}_comparable"] else f"{note}, not comparable"
-
-
-def stage_bars(stages: Sequence[Mapping[str, Any]]) -> list[Bar]:
-    """Seconds of every stage."""
-    names = [str(stage["name"]).replace("_", " ").capitalize() for stage in stages]
-    seconds = [float(stage["seconds"]) for stage in stages]
-    longest = max(seconds, default=1.0) or 1.0
-    return [Bar(name, took, took / longest) for name, took in zip(names, seconds, strict=True)]
 
 
 def comparison_bars(figures: Mapping[str, Any]) -> list[BarGroup]:
@@ -198,23 +146,6 @@ def error_rows(errors: Mapping[str, Any]) -> list[ErrorRow]:
     return rows
 
 
-def calibration_rows(report: Mapping[str, Any]) -> list[CalibrationRow]:
-    """Errors of each take with the measured calibration, and those with the true one."""
-    rows = []
-    for take, found in report.get("errors_by_calibration", {}).items():
-        for key, name, unit, _ in ERRORS:
-            if key in found["measured"]:
-                shown = f"{take.capitalize()}: {name.lower().removesuffix(' error')}"
-                measured, true = _at_least(found["measured"][key]), _at_least(found["true"][key])
-                rows.append(CalibrationRow(shown, measured, true, unit))
-    return rows
-
-
-def _at_least(value: object) -> str:
-    is_small = is_number(value) and abs(float(str(value))) < LEAST_SHOWN
-    return f"< {LEAST_SHOWN}" if is_small else figure(value)
-
-
 def clock_rows(errors: Mapping[str, Any]) -> list[ErrorRow]:
     """Errors of the clock fits of all streams."""
     return [
@@ -227,17 +158,6 @@ def clock_rows(errors: Mapping[str, Any]) -> list[ErrorRow]:
         )
         for stream, value in dict(errors.get("clock_rms_ms", {})).items()
     ]
-
-
-def agreement_figures(agreement: Mapping[str, Any]) -> list[AgreementFigure]:
-    """Agreement figures available for a task."""
-    found = []
-    for key, name in AGREEMENT:
-        if key in agreement:
-            interval = agreement.get(f"{key}_interval")
-            known = (interval[0], interval[1]) if isinstance(interval, list) else None
-            found.append(AgreementFigure(name, agreement[key], known))
-    return found
 
 
 def failure_rows(report: Mapping[str, Any]) -> list[FailureRow]:
@@ -311,71 +231,13 @@ def latex_tables(report: ClosedLoopReport) -> str:
     are in no rate; their number follows it. The tables have the form of `policy_evaluator` and
     `wm_real_corr` of the paper, and need the packages booktabs and multirow.
     """
-    rows = {(row["task"], row["policy"]): row for row in report.policy_rows()}
-    worlds = {REAL: "Real world"} | {world: escape(world) for world in report.imagined_worlds}
-    rates = {
-        policy: [
-            (name, [_rate(rows[task, policy], world, report) for task in report.tasks])
-            for world, name in worlds.items()
-        ]
-        for policy in report.policies
-    }
-    agreement = {
-        world: [
-            (name, [_with_interval(one.get(key), one.get(f"{key}_interval")) for one in found])
-            for key, name in _FIGURES
-        ]
-        for world in report.imagined_worlds
-        for found in [report.agreement(world).values()]
-    }
-    lines = _table(report.tasks, "Policy", "World", rates)
-    if agreement:
-        lines += _table(report.tasks, "World", "Figure", agreement)
-    return "\n".join(lines)
-
-
-def escape(text: str) -> str:
-    """Text with LaTeX's special characters escaped."""
-    return "".join(_ESCAPED.get(letter, letter) for letter in text)
-
-
-def _table(
-    tasks: Sequence[str],
-    first: str,
-    second: str,
-    groups: Mapping[str, Sequence[tuple[str, Sequence[str]]]],
-) -> list[str]:
-    """Lines of a table with a column a task, whose groups of rows have a label in common."""
-    lines = [
-        rf"\begin{{tabular}}{{ll{'c' * len(tasks)}}}",
-        r"\toprule",
-        _row(first, second, [escape(task.replace("_", " ")) for task in tasks]),
-    ]
-    for title, rows in groups.items():
-        label = rf"\multirow{{{len(rows)}}}{{*}}{{{escape(title)}}}"
-        lines.append(r"\midrule")
-        for index, (name, cells) in enumerate(rows):
-            lines.append(_row("" if index else label, name, cells))
-    return [*lines, r"\bottomrule", r"\end{tabular}", ""]
-
-
-def _row(first: str, second: str, cells: Sequence[str]) -> str:
-    return " & ".join([first, second, *cells]) + r" \\"
-
-
-def _rate(row: Mapping[str, Any], world: str, report: ClosedLoopReport) -> str:
-    if world == REAL:
-        return _with_interval(row[REAL], row.get("real_interval"))
-    is_first = world == report.imagined_worlds[0]
-    name, cell = ("imagined", row) if is_first else ("success", row["other_worlds"][world])
-    rate = _with_interval(cell[name], cell.get(f"{name}_interval"))
-    undecided = undecided_note(cell, name)
-    return rf"{rate} {{\scriptsize {escape(undecided)}}}" if undecided else rate
-
-
-def _with_interval(value: object, interval: object) -> str:
-    if not is_number(value):
-        return "--" if figure(value) == UNDEFINED else figure(value)
-    if not isinstance(interval, list):
-        return f"{value:.3f}"
-    return rf"{value:.3f} {{\scriptsize [{interval[0]:.2f}, {interval[1]:.2f}]}}"
+    agreement = {world: report.agreement(world) for world in report.imagined_worlds}
+    return rendered(
+        "tables.tex.j2",
+        report=report,
+        rows={(row["task"], row["policy"]): row for row in report.policy_rows()},
+        worlds={REAL: "Real world"} | {one: escape_latex(one) for one in report.imagined_worlds},
+        agreement=agreement,
+        figures=_FIGURES,
+        undecided_note=undecided_note,
+    )

@@ -25,11 +25,12 @@ from services.evaluation.studies.study_figures import (
     StudyFigures,
     StudyRollout,
     StudySummary,
+    picture,
+    picture_name,
     study_figures,
     study_rollouts,
     study_summary,
 )
-from services.evaluation.studies.study_pictures import picture, picture_name
 
 SCOPE: Final = "study_read"
 PICTURE_TYPES: Final = {"svg": "image/svg+xml", "png": "image/png", "tex": "application/x-tex"}
@@ -41,12 +42,23 @@ MAX_READING_SHARE: Final = 0.1
 
 @dataclass
 class _Study:
-    """Results of a study as they were at one moment; figures are computed when asked for."""
+    """A study as it was read last; figures are computed when asked for.
+
+    `version` is that of its file; while the study runs, it is not read again before `until_s`.
+    """
 
     name: str
+    version: tuple[int, int]
     definition: StudyDefinition
     results: StudyResults
     changed_at: datetime
+    took_s: float = 0.0
+    until_s: float = 0.0
+
+    def took(self, seconds: float) -> None:
+        """Count time that reading took, and wait for a multiple of it."""
+        self.took_s += seconds
+        self.until_s = time.monotonic() + self.took_s / MAX_READING_SHARE
 
     @property
     def summary(self) -> StudySummary:
@@ -61,22 +73,12 @@ class _Study:
         return study_figures(self.definition, self.results, self.rollouts, self.summary)
 
 
-@dataclass
-class _Read:
-    """What was read last, from which version of the file, and how long it took."""
-
-    version: tuple[int, int]
-    study: _Study
-    until_s: float
-    took_s: float
-
-
 class StudyFolders:
     """Studies in the subfolders of a folder."""
 
     def __init__(self, root: Path) -> None:
         self._root = root
-        self._reads: dict[str, _Read] = {}
+        self._studies: dict[str, _Study] = {}
         self._lock = threading.Lock()
 
     def summaries(self) -> list[StudySummary]:
@@ -90,19 +92,13 @@ class StudyFolders:
         return [self._summary(path.parent.name) for _, path in newest]
 
     def figures(self, name: str) -> StudyFigures:
-        """Figures of a study.
-
-        Raises:
-            NotFoundError: no such study.
-            CorruptDataError: its results are damaged.
-        """
+        """Figures of a study; raises NotFoundError if there is none, or as `StudyResults.read`."""
         with self._lock:
             study = self._read(name)
             if "figures" not in vars(study):
-                began_s, read = time.monotonic(), self._reads[name]
+                began_s = time.monotonic()
                 _ = study.figures
-                read.took_s += time.monotonic() - began_s
-                read.until_s = time.monotonic() + read.took_s / MAX_READING_SHARE
+                study.took(time.monotonic() - began_s)
             figures = study.figures
         running = {"is_running": StudyResults.is_running(self._root / name)}
         summary = figures.summary.model_copy(update=running)
@@ -133,11 +129,11 @@ class StudyFolders:
         status = path.stat()
         version = (status.st_mtime_ns, status.st_size)
         began_s = time.monotonic()
-        last = self._reads.get(name)
-        if last is not None and last.version == version:
-            return last.study
-        if last is not None and began_s < last.until_s and StudyResults.is_running(path.parent):
-            return last.study
+        last = self._studies.get(name)
+        if last is not None:
+            must_wait = began_s < last.until_s and StudyResults.is_running(path.parent)
+            if last.version == version or must_wait:
+                return last
         results = StudyResults.read(path.parent)
         try:
             definition = StudyDefinition.model_validate(results.header.definition)
@@ -147,10 +143,9 @@ class StudyFolders:
                 f"({first_problems(error)})"
             ) from error
         changed_at = datetime.fromtimestamp(status.st_mtime, UTC)
-        study = _Study(name, definition, results, changed_at)
-        took_s = time.monotonic() - began_s
-        until_s = began_s + took_s + took_s / MAX_READING_SHARE
-        self._reads[name] = _Read(version, study, until_s, took_s)
+        study = _Study(name, version, definition, results, changed_at)
+        study.took(time.monotonic() - began_s)
+        self._studies[name] = study
         return study
 
 

@@ -38,15 +38,10 @@ Start = MatchedStart | FailedStart
 class StudyParts:
     """What the rollouts of a study need.
 
-    Attributes:
-        connect: opens connections to all worlds; called once per thread.
-        load_policies: creates all policies by name; called once per thread, since a policy may keep
-            a state between calls.
-        probe: success classifier of all worlds that have none of their own.
-        instructions: of every task.
-        trained_on: digests of training starts of each trained component, which are refused.
-        store: where rollouts are kept; None to keep none.
-        own_probes: success classifiers that were calibrated for single worlds, by world.
+    `connect` opens connections to all worlds, and `load_policies` creates all policies by name,
+    once per thread, since a policy may keep a state between calls. `probe` judges all worlds that
+    have none of their own (`own_probes`). `trained_on` are digests of training starts of each
+    trained component, which are refused; without a `store` no rollout is kept.
     """
 
     connect: Callable[[ExitStack], StudyWorlds]
@@ -65,17 +60,12 @@ def run_study(
     *,
     retry_failed: bool = False,
 ) -> ClosedLoopReport:
-    """Run the rollouts that have no result yet.
+    """Run the rollouts that have no result yet, and with `retry_failed` failed ones again.
 
     Equal definitions give equal reports, however often the study was interrupted and however many
-    rollouts were in flight, if worlds and policies are deterministic.
-
-    Every outcome is added to the results of earlier runs as soon as it is known. With
-    `retry_failed`, failed rollouts are run again.
-
-    Raises:
-        ConflictError: a start was trained on, or the study is being run already.
-        UnavailableError: a world stopped answering; the other results are kept.
+    rollouts were in flight, if worlds and policies are deterministic. Every outcome is kept as soon
+    as it is known. Raises ConflictError if a start was trained on or the study is being run
+    already, and UnavailableError if a world stopped answering.
     """
     with results.locked():
         missing = missing_rollouts(definition, results, retry_failed=retry_failed)
@@ -102,14 +92,9 @@ def run_rollouts(
     parts: StudyParts,
     keep: Callable[[Outcome], None],
 ) -> None:
-    """Run some rollouts of a study; `keep` is called with each outcome as soon as it is known.
+    """Run some rollouts of a study, or of a part of it; raises as `run_study`.
 
-    `definition` is the study's or a part of it, with the tasks and seeds of the rollouts; `header`
-    is that of the whole study.
-
-    Raises:
-        ConflictError: a start was trained on.
-        UnavailableError: a world stopped answering.
+    `keep` is called with each outcome as soon as it is known; the header is the whole study's.
     """
     if missing:
         with ExitStack() as connections:
@@ -221,12 +206,7 @@ class _Workers:
 
 
 class PolicyFactory:
-    """Creates the policies of a study, `demonstrator` those of scripts; shared data is read once.
-
-    Raises:
-        UnknownNameError: a script or task that the twin does not know.
-        NotFoundError, CorruptDataError: a file or store that cannot be read.
-    """
+    """Creates the policies of a study, those of scripts by `demonstrator`; reads data once."""
 
     def __init__(
         self, definition: StudyDefinition, demonstrator: Callable[[str], ReplayPolicy]

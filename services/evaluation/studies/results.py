@@ -207,11 +207,7 @@ _HEADER: Final = TypeAdapter(StudyHeader)
 
 
 class StudyResults:
-    """The results of one study; open with `create_or_resume`.
-
-    Attributes:
-        outcomes: of all finished rollouts by cell.
-    """
+    """The results of one study, by rollout; open with `create_or_resume`."""
 
     def __init__(
         self, path: Path, header: StudyHeader, outcomes: dict[PlannedRollout, Outcome]
@@ -224,11 +220,8 @@ class StudyResults:
     def create_or_resume(cls, folder: Path, header: StudyHeader) -> "StudyResults":
         """Open the results of a study; an incomplete last line of a killed study is removed.
 
-        Raises:
-            ConflictError: the folder holds results of another study, or of other worlds or
-                policies, or another process is running the study.
-            CorruptDataError: a damaged line.
-            StorageError: the file cannot be read or written.
+        Raises ConflictError if the folder holds results of another study, worlds or policies, or
+        another process is running it, and as `read`.
         """
         path = folder / FILE
         try:
@@ -259,9 +252,7 @@ class StudyResults:
     def read(cls, folder: Path) -> "StudyResults":
         """Read the results in a folder; an incomplete last line is ignored.
 
-        Raises:
-            StorageError: there are none, or they cannot be read.
-            CorruptDataError: a damaged line.
+        Raises StorageError if they cannot be read, and CorruptDataError for a damaged line.
         """
         path = folder / FILE
         try:
@@ -362,15 +353,7 @@ def study_report(definition: StudyDefinition, results: StudyResults) -> ClosedLo
 
 def _not_run(planned: PlannedRollout) -> RolloutFailure:
     message = "no result yet; `dextouch study run` continues the study"
-    return RolloutFailure(
-        planned.world,
-        planned.policy,
-        planned.task,
-        planned.seed,
-        "NotRunYet",
-        message,
-        repeat=planned.repeat,
-    )
+    return RolloutFailure(**planned._asdict(), error="NotRunYet", message=message)
 
 
 def rollout_episode_id(header: StudyHeader, planned: PlannedRollout) -> str:

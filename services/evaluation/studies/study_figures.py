@@ -1,31 +1,34 @@
-"""What a study's page shows: rates by policy, task and world, agreement, and single rollouts."""
+"""What a study's page and its papers show: rates, agreement, single rollouts, and pictures."""
 
+import itertools
+import tomllib
 from collections import Counter
 from collections.abc import Iterator
-from datetime import datetime
+from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, get_args
 
 import structlog
 from pydantic import AwareDatetime
 
 from dextouch.command_line import write_result
 from dextouch.episodes import EpisodeStore
-from dextouch.errors import DexTouchError
+from dextouch.errors import DexTouchError, UnknownNameError
 from dextouch.frozen_model import FrozenModel
-from services.evaluation.filmed_pairs import example_pairs, title_of
-from services.evaluation.reporting import (
+from services.evaluation.closed_loop import example_pairs, title_of
+from services.evaluation.reporting import write_report
+from services.evaluation.reporting.pictures import (
     MAX_MOVING,
     PredictionPicture,
     ReportPictures,
     episode_pair,
-    write_report,
 )
+from services.evaluation.reporting.policy_picture import Format, Rate, policy_picture
 from services.evaluation.reporting.sections import latex_tables
 from services.evaluation.scores import (
     LEAST_DECIDED,
     REAL,
-    UNDEFINED,
     VAGUE_R,
     ClosedLoopReport,
     RolloutFailure,
@@ -42,31 +45,21 @@ from services.evaluation.studies.results import (
     rollout_episode_id,
     study_report,
 )
+from services.evaluation.templates import UNDEFINED
 
 logger = structlog.get_logger(__name__)
 
 # From this difference of success on, two worlds disagree about a start.
 DISAGREEMENT: Final = 0.5
 MEANINGS: Final = {
-    "rate": "Share of the starts from which the policy succeeded, with its 95 % Wilson interval. "
-    "In an imagined world success is what the success classifier decides from images, touch and "
-    "object poses and from the world's own estimate; rollouts that it cannot tell count in no "
-    "rate.",
-    "pearson": "Pearson's r: 1 if the world's success rates of the policies are a straight line "
-    "over the real ones, 0 if they say nothing about them, negative if they reverse them. It needs "
-    "three policies: two points always lie on a line.",
-    "mmrv": "Mean maximum rank violation: for each policy the largest real difference to a policy "
-    "that the world ranks the other way, averaged over the policies; 0 if it never does.",
-    "mean_absolute_error": "Mean absolute difference of the world's success rates from the real "
-    "ones.",
-    "bias": "Mean of the world's success rates minus the real ones; above 0 it is too optimistic.",
-    "interval": "Intervals contain the true policies' figure with 95 % probability; with few "
-    "policies or starts they are wide.",
-    "unreliable": "The success classifier cannot tell: its probability is too close to 0.5, it and "
-    "the world's own estimate contradict each other, or the world called its prediction unreliable "
-    "at a step. "
-    f"With fewer than {LEAST_DECIDED:.0%} of its rollouts decided a policy is not compared.",
+    name: text.replace("{share}", f"{LEAST_DECIDED:.0%}")
+    for name, text in tomllib.loads(
+        Path(__file__).with_name("meanings.toml").read_text(encoding="utf-8")
+    ).items()
 }
+FIGURES_SHOWN: Final = (
+    "pearson", "spearman", "kendall", "mmrv", "bias", "mean_absolute_error",
+)  # fmt: skip
 REPORT_FILE: Final = "report.json"
 TABLES_FILE: Final = "tables.tex"
 
@@ -88,15 +81,11 @@ class StudySummary(FrozenModel):
 
 
 class StudyRate(FrozenModel):
-    """Success rate of a policy in a task of a world; None without decided rollouts.
+    """Success rate of a policy in a task of a world, with its 95 % Wilson interval.
 
-    Attributes:
-        interval: 95 % Wilson interval.
-        num_missing: rollouts without a result yet.
-        num_unreliable: rollouts on which the success classifier abstains, and `reasons` why; they
-            count in no rate.
-        is_comparable: whether enough of the rollouts are decided to compare the policy.
-        num_disagreements: starts whose outcome differs from the real one.
+    It is None without decided rollouts: the success classifier abstains on `num_unreliable`, for
+    `reasons`, which count in no rate; `is_comparable` if it decided enough. `num_missing` have no
+    result yet, and `num_disagreements` starts have another outcome than in the real world.
     """
 
     world: str
@@ -198,7 +187,6 @@ def study_rollouts(definition: StudyDefinition, results: StudyResults) -> tuple[
 
 
 def _unlike(rollout: StudyRollout) -> tuple[bool, bool, float]:
-    """Disagreements first, and of these the ones that the probe is sure of."""
     sureness = abs((rollout.probability or 0.0) - 0.5)
     return not rollout.disagrees, rollout.unreliable is not None, -sureness * rollout.disagrees
 
@@ -261,70 +249,51 @@ def _rates(report: ClosedLoopReport, rollouts: tuple[StudyRollout, ...]) -> Iter
             reasons.setdefault(place, {})[one.unreliable] = None
         if one.real_success is not None:
             unlike.setdefault(place, {}).setdefault(one.seed, []).append(one.disagrees)
-    for row in report.policy_rows():
-        for world, name, fields in _worlds_of(row, report.imagined_worlds):
-            place = (world, row["task"], row["policy"])
-            rate, interval = fields[name], fields.get(f"{name}_interval")
-            yield StudyRate(
-                world=world,
-                task=row["task"],
-                policy=row["policy"],
-                rate=None if rate == UNDEFINED else rate,
-                interval=None if interval is None else (interval[0], interval[1]),
-                num_finished=fields[f"{name}_rollouts"],
-                num_failed=fields[f"{name}_failed"] - missing[place],
-                num_missing=missing[place],
-                num_unreliable=fields.get(f"{name}_undecided", 0),
-                is_comparable=fields.get(f"{name}_comparable", True),
-                reasons=tuple(reasons.get(place, ())),
-                num_disagreements=sum(
-                    sum(repeats) >= DISAGREEMENT * len(repeats)
-                    for repeats in unlike.get(place, {}).values()
-                ),
-            )
-
-
-def _worlds_of(
-    row: dict[str, Any], imagined: tuple[str, ...]
-) -> Iterator[tuple[str, str, dict[str, Any]]]:
-    """World, name of its entries, and where they are, in a row of `policy_rows`."""
-    yield REAL, REAL, row
-    if imagined:
-        yield imagined[0], "imagined", row
-    for world, fields in row["other_worlds"].items():
-        yield world, "success", fields
+    worlds = (REAL, *report.imagined_worlds)
+    for task, policy, world in itertools.product(report.tasks, report.policies, worlds):
+        place, figures = (world, task, policy), report.figures(world, task, policy)
+        yield StudyRate(
+            world=world,
+            task=task,
+            policy=policy,
+            rate=None if figures["rate"] == UNDEFINED else figures["rate"],
+            interval=figures.get("interval"),
+            num_finished=figures["rollouts"],
+            num_failed=figures["failed"] - missing[place],
+            num_missing=missing[place],
+            num_unreliable=figures.get("undecided", 0),
+            is_comparable=figures.get("comparable", True),
+            reasons=tuple(reasons.get(place, ())),
+            num_disagreements=sum(
+                sum(repeats) >= DISAGREEMENT * len(repeats)
+                for repeats in unlike.get(place, {}).values()
+            ),
+        )
 
 
 def _agreement(report: ClosedLoopReport, world: str) -> Iterator[StudyAgreement]:
-    alone = ClosedLoopReport(report.scores, (world,), report.policies, report.failures).to_report()
-    for task, found in alone["agreement"].items():
-        yield _agreed(world, task, found, tuple(alone["comments"][task]))
+    alone = replace(report, imagined_worlds=(world,)).to_report()
+    tasks = alone["agreement"]
     if alone["agreement_of_all_tasks"]:
-        counts = [found["num_policies"] for found in alone["agreement"].values()]
-        starts = [found["num_starts"] for found in alone["agreement"].values()]
-        counted = {"num_policies": max(counts), "num_starts": sum(starts)}
-        yield _agreed(world, "", alone["agreement_of_all_tasks"] | counted, ())
-
-
-def _agreed(
-    world: str, task: str, found: dict[str, Any], comments: tuple[str, ...]
-) -> StudyAgreement:
-    names = ("pearson", "spearman", "kendall", "mmrv", "bias", "mean_absolute_error")
-    figures = {name: found[name] for name in names}
-    intervals = {name: found.get(f"{name}_interval", UNDEFINED) for name in names}
-    chance = found.get("pearson_chance", UNDEFINED)
-    return StudyAgreement(
-        world=world,
-        task=task,
-        figures={name: None if isinstance(v, str) else v for name, v in figures.items()},
-        intervals={n: None if v == UNDEFINED else tuple(v) for n, v in intervals.items()},
-        is_vague=intervals["pearson"] != UNDEFINED and intervals["pearson"][0] < VAGUE_R,
-        undefined=undefined_by(found["num_policies"]),
-        chance=None if isinstance(chance, str) else chance,
-        num_policies=found["num_policies"],
-        num_starts=found["num_starts"],
-        comments=comments,
-    )
+        num_policies = max(found["num_policies"] for found in tasks.values())
+        num_starts = sum(found["num_starts"] for found in tasks.values())
+        counted = {"num_policies": num_policies, "num_starts": num_starts}
+        tasks = tasks | {"": alone["agreement_of_all_tasks"] | counted}
+    for task, found in tasks.items():
+        known = {name: None if isinstance(v, str) else v for name, v in found.items()}
+        intervals: dict[str, Any] = {n: known.get(f"{n}_interval") for n in FIGURES_SHOWN}
+        yield StudyAgreement(
+            world=world,
+            task=task,
+            figures={name: known[name] for name in FIGURES_SHOWN},
+            intervals={name: one and tuple(one) for name, one in intervals.items()},
+            is_vague=bool(intervals["pearson"]) and intervals["pearson"][0] < VAGUE_R,
+            undefined=undefined_by(found["num_policies"]),
+            chance=known.get("pearson_chance"),
+            num_policies=found["num_policies"],
+            num_starts=found["num_starts"],
+            comments=tuple(alone["comments"].get(task, ())),
+        )
 
 
 def kept_pairs(
@@ -357,11 +326,54 @@ def write_reports(results: StudyResults, json_path: Path | None) -> dict[str, An
         write_result(path, figures, allow_nan=False)
     for world in definition.imagined:
         others = tuple(name for name in definition.imagined if name != world)
-        page = ClosedLoopReport(
-            report.scores, (world, *others), report.policies, report.failures
-        ).to_report()
+        page = replace(report, imagined_worlds=(world, *others)).to_report()
         title = f"{definition.name}: {world} and the real world"
         pictures = ReportPictures(moving=kept_pairs(report, world, results))
         write_report(page | {"title": title}, pictures, folder / f"report {world}.html")
     (folder / TABLES_FILE).write_text(latex_tables(report), encoding="utf-8")
     return figures
+
+
+def picture(figures: StudyFigures, world: str, task: str, form: Format) -> bytes:
+    """The picture of an imagined world, of one task or, with an empty name, of all.
+
+    Policies of which too few rollouts are decided are left out, as from the agreement. Raises
+    UnknownNameError if the study has no such world or task.
+    """
+    known = figures.summary
+    if world not in known.worlds:
+        raise UnknownNameError("imagined world of the study", world, list(known.worlds))
+    if task and task not in known.tasks:
+        raise UnknownNameError("task of the study", task, list(known.tasks))
+    rates = {(one.world, one.task, one.policy): one for one in figures.rates}
+    pairs: dict[str, list[tuple[Rate, Rate]]] = {name: [] for name in known.policies}
+    for one in figures.rates:
+        other = rates[world, one.task, one.policy]
+        if one.world == REAL and task in {"", one.task} and None not in {one.rate, other.rate}:
+            pairs[one.policy] += [(_values(one), _values(other))] * other.is_comparable
+    title = f"{world}, {task.replace('_', ' ') or 'all tasks'}"
+    return policy_picture(pairs, title, form)
+
+
+def picture_name(world: str, task: str, form: Format) -> str:
+    """Name of the file of a picture."""
+    return f"policies {world} {task or 'all tasks'}.{form}"
+
+
+def write_pictures(results: StudyResults) -> None:
+    """Write pictures of all imagined worlds and tasks beside the results, in all formats."""
+    folder = results.path.parent
+    definition = StudyDefinition.model_validate(results.header.definition)
+    summary = study_summary(folder.name, definition, results, datetime.now(UTC))
+    rollouts = study_rollouts(definition, results)
+    figures = study_figures(definition, results, rollouts, summary)
+    for world in figures.summary.worlds:
+        for task in (*figures.summary.tasks, *([""] * (len(figures.summary.tasks) > 1))):
+            for form in get_args(Format):
+                path = folder / picture_name(world, task, form)
+                path.write_bytes(picture(figures, world, task, form))
+
+
+def _values(rate: StudyRate) -> Rate:
+    value = float(rate.rate or 0.0)
+    return value, *(rate.interval or (value, value))

@@ -2,6 +2,7 @@
 
 import argparse
 import importlib
+import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,168 +13,8 @@ from services.alignment.station_calibration.boards import BOARD_HELP
 
 EXIT_LEVEL = 1
 
-_ABOUT = """\
-Calibrate the devices of a station. All results are written to one folder:
-  calibration.json           matrices, as stored in recordings; start the station with
-                             DEXTOUCH_ACQUISITION_CALIBRATION=FOLDER/calibration.json
-  calibration_details.json   sigma, time, software, inputs
-  pictures/                  plots of coverage and residuals
-
-A complete calibration:
-  1. glove     at a running station, which records rest and known pressures step by step
-               dextouch station calibrate glove --side left --url http://127.0.0.1:8083 \\
-                 --to calibration
-  2. camera    25 photos of a printed board, everywhere in the image, near and far, tilted
-               dextouch station calibrate camera --camera head --photos photos/head \\
-                 --board charuco:5x7:30mm:22mm --to calibration
-  3. hand-eye  20 photos of a fixed board with the tracker's pose at each, rotated about all axes
-               dextouch station calibrate hand-eye --camera head --photos photos/mount \\
-                 --poses photos/mount/poses.csv --board charuco:5x7:30mm:22mm --to calibration
-  4. show      age and sigma of everything; warns after seven days
-               dextouch station calibrate show calibration
-
-If required:
-  wrist        gloves whose keypoints are not in wrist axes: a take of the flat hand
-  profile      once per person: a take in which the hand opens, closes and spreads
-  robot-base   robots that report poses in their base frame: pose pairs of tracker and effector
-  time         path delays of trackers and cameras: a take in which all are shaken together
-  latency      a glove, or its tracker, with unknown path delay: a take of taps
-
-More: docs/calibration_guide.md"""
-
-_CAMERA = """\
-Good photos: 25 of them, with the board in every ninth of the image including the corners, near and
-far, tilted towards each of its edges by 20 to 45 degrees, static and sharp. The residual is not a
-measure of accuracy (it is as small for 8 photos as for 40): check the sigma (±).
-
-  --photos FOLDER            calibrate with the photos of a folder
-  --photos FOLDER --watch    watch for new photos, report what is missing, then calibrate
-  --photos FOLDER --url URL  take still views from a running station into the folder, likewise
-  --check                    only report the coverage of the photos and advice
-
-example:
-  dextouch station calibrate camera --camera head --photos photos/head \\
-    --board charuco:5x7:30mm:22mm --to calibration"""
-
-_HAND_EYE = """\
-The board is fixed; hold the tracker with its camera still at every photo. Rotate it by 30 degrees
-or more about at least two of its axes, better three. The camera must be calibrated first
-(--intrinsics: its folder, if it is not --to). With poses of the board in the file no photos are
-needed. If poses are refused as inverted, --invert inverts that side.
-
-example:
-  dextouch station calibrate hand-eye --camera head --photos photos/mount \\
-    --poses photos/mount/poses.csv --board charuco:5x7:30mm:22mm --to calibration"""
-
-_GLOVE = """\
-  --url URL                  a running station records all takes: this command guides you (rest,
-                             then each pressure), checks every take and repeats invalid ones. The
-                             takes are read from the station's --spool; on another machine give
-                             --store URL, and they are read after their upload
-  --rest TAKE --presses CSV  existing takes: folders of a spool, or ids with --store URL
-
-The list of presses is a CSV: take and pressure_kpa, or mass_kg and area_cm2 of a weight; optional
-columns are sigma_kpa, pads (thumb+index, palm, all), start_s, stop_s (seconds in the take).
-  take,pressure_kpa,sigma_kpa,pads
-  spool/bladder-10,10,0.1,all
-  spool/bladder-30,30,0.3,all
-Without presses only the tare is measured, for example daily; the gain is kept.
-
-example:
-  dextouch station calibrate glove --side left --url http://127.0.0.1:8083 --to calibration"""
-
-_WRIST = """\
-Record one second or more of the flat hand, fingers straight; once for each person and glove.
-
-example:
-  dextouch station calibrate wrist --side left --take spool/flat-left --to calibration"""
-
-_PROFILE = """\
-Record ten seconds in which the hand opens, closes and spreads its fingers. Without a profile every
-recording's own motion is used, which is less accurate.
-
-example:
-  dextouch station calibrate profile --side left --take spool/fist-left --to calibration"""
-
-_ROBOT_BASE = """\
-Fix a tracker to the robot's effector and stop at 20 poses all over the workspace, rotated by 30
-degrees or more about all axes. The file holds a pair of 4x4 matrices for each:
-  [[T_world_tracker, T_base_effector], ...]
-The mount of the tracker on the effector is estimated too, unless --same-frame states that both
-series are poses of the same frame.
-
-example:
-  dextouch station calibrate robot-base --poses pairs.json --to calibration"""
-
-_SHOW = """\
-example:
-  dextouch station calibrate show calibration"""
-
-_LATENCY = """\
-Of a glove against its tracker: tap a hard table with the flat hand, ten times, half a second and
-more apart. The result is relative to the latency that the reference has. For trackers and cameras
-use `time`, which measures all at once.
-
-example:
-  dextouch station calibrate latency --stream wrist_left --reference tactile_left \\
-    --take spool/taps --to calibration"""
-
-_TIME = """\
-Hold or strap trackers and cameras together rigidly, and turn them briskly and irregularly about all
-axes for ten seconds, cameras towards a room with edges (not a bare wall) and in good light.
-Trackers may be of several systems, whose worlds differ. Each camera needs its K (of --to or of the
-take). Gloves whose keypoints are in wrist axes do not show how the hand turns: use `latency` with
-taps.
-
-Delays are relative to --reference; by default to the stream whose latency is known best.
-
-example:
-  dextouch station calibrate time --take spool/shake --to calibration"""
-
-# What each command measures, its longer help, and `module:function` that runs it.
-_COMMANDS = {
-    "camera": (
-        "photos of a board → K and distortion of a camera",
-        _CAMERA,
-        "pipelines.calibrate.cameras:calibrate",
-    ),
-    "hand-eye": (
-        "photos and poses → camera on its tracker",
-        _HAND_EYE,
-        "alignment.station_calibration.mount:calibrate_mount",
-    ),
-    "glove": (
-        "rest and known pressures → tare, gain, faults",
-        _GLOVE,
-        "alignment.station_calibration.glove:calibrate",
-    ),
-    "wrist": (
-        "flat hand → wrist axes of a glove's keypoints",
-        _WRIST,
-        "pipelines.calibrate.takes:measure_wrist",
-    ),
-    "profile": (
-        "moving hand → the person's bones and knuckles",
-        _PROFILE,
-        "pipelines.calibrate.takes:measure_person",
-    ),
-    "robot-base": (
-        "pairs of poses → the robot's base in the world",
-        _ROBOT_BASE,
-        "pipelines.calibrate.cameras:calibrate_base",
-    ),
-    "time": (
-        "shaking everything together → all path delays",
-        _TIME,
-        "alignment.station_calibration.times:measure_times",
-    ),
-    "latency": (
-        "taps of a hand → path delay of glove or tracker",
-        _LATENCY,
-        "pipelines.calibrate.takes:measure_latency",
-    ),
-    "show": ("contents, age and accuracy of a calibration", _SHOW, "pipelines.calibrate.show:show"),
-}
+# What each command measures (`does`), its longer help, and `module:function` that runs it.
+_WORDS = tomllib.loads(Path(__file__).with_name("commands.toml").read_text(encoding="utf-8"))
 
 
 def main(argv: Sequence[str]) -> int:
@@ -182,7 +23,7 @@ def main(argv: Sequence[str]) -> int:
     Returns 0; for `show` 1 if something is missing or wrong (level ERROR).
     """
     options = _parser().parse_args(list(argv))
-    module, _, function = _COMMANDS[options.word][2].partition(":")
+    module, _, function = _WORDS["commands"][options.word]["runs"].partition(":")
     run = getattr(importlib.import_module(f"services.{module}"), function)
     report: dict[str, object] = run(options)
     write_result(options.json, report, allow_nan=False)
@@ -190,11 +31,11 @@ def main(argv: Sequence[str]) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = CommandParser(prog="dextouch station calibrate", description=_ABOUT)
+    parser = CommandParser(prog="dextouch station calibrate", description=_WORDS["about"])
     words = parser.add_subparsers(dest="word", required=True, metavar="WORD")
     of = {
-        name: words.add_parser(name, help=does, description=does, epilog=more)
-        for name, (does, more, _) in _COMMANDS.items()
+        name: words.add_parser(name, help=one["does"], description=one["does"], epilog=one["more"])
+        for name, one in _WORDS["commands"].items()
     }
 
     def add(names: str, flag: str, **how: Any) -> None:  # noqa: ANN401 - argparse's own

@@ -7,18 +7,18 @@ from datetime import datetime
 from rich.console import Console
 from rich.table import Table
 
-from services.alignment.station_calibration.judgement import (
+from services.alignment.station_calibration.record import (
     LEVELS,
     Finding,
     judge,
-    load,
+    load_matrices,
     missing_names,
 )
 
 
 def show(options: argparse.Namespace, *, now: datetime | None = None) -> dict[str, object]:
     """Print every calibration with age and sigma, and return them as data."""
-    matrices = load(options.folder)
+    matrices = load_matrices(options.folder)
     findings = judge(matrices, now)
     missing = missing_names(matrices)
     _print(findings)

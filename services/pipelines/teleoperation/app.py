@@ -1,8 +1,4 @@
-"""Service that sends commands to robot hands, which follow tracked hands live.
-
-Each hand has one WebSocket, and one controller at a time (docs/teleoperation.md). Commands come
-from a loop of their own, whether samples come or not.
-"""
+"""Service that commands robot hands, which follow tracked ones live (docs/teleoperation.md)."""
 
 import asyncio
 import time
@@ -71,8 +67,6 @@ class TeleoperationMetrics:
 
 
 class _Control:
-    """One connection that controls one hand."""
-
     def __init__(
         self, socket: WebSocket, side: Side, follower: HandFollower, metrics: TeleoperationMetrics
     ) -> None:
@@ -85,9 +79,8 @@ class _Control:
     async def run(self) -> None:
         """Answer the first message, which starts the hand; then command it until the end.
 
-        Raises:
-            WebSocketDisconnect: the client is gone before it started.
-            InvalidInputError: the first message is no valid start.
+        Raises WebSocketDisconnect if the client is gone before it started, and InvalidInputError if
+        the first message is no valid start.
         """
         form, value = _message(await self._socket.receive())
         if form != "start":
@@ -188,9 +181,7 @@ class _Control:
 def _message(received: Any) -> tuple[str, Any]:  # noqa: ANN401 - of ASGI
     """Name and content of a message: angles by joint of a start, a sample, or nothing of a stop.
 
-    Raises:
-        WebSocketDisconnect: the client is gone.
-        InvalidInputError: it is none of these.
+    Raises WebSocketDisconnect if the client is gone, and InvalidInputError for anything else.
     """
     if received["type"] == "websocket.disconnect":
         raise WebSocketDisconnect(received.get("code", 1005))

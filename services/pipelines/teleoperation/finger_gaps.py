@@ -23,15 +23,9 @@ TOLERANCE_M: Final = 1e-12
 class FingerGaps:
     """Distances between the surfaces of a hand's fingers, and movements that keep them.
 
-    The palm is not among them.
-
-    Args:
-        hand: any hand.
-        radii_m: [fingers, 3], of the links knuckle-PIP, PIP-DIP and DIP-tip. The tip is on the
-            surface: the last capsule ends one radius before it.
-
-    Raises:
-        ShapeError: other radii than three a finger.
+    The palm is not among them. `radii_m` [fingers, 3] are those of the links knuckle-PIP, PIP-DIP
+    and DIP-tip; the tip is on the surface: the last capsule ends one radius before it. Raises
+    ShapeError for other radii than three a finger.
     """
 
     def __init__(self, hand: HandModel, radii_m: np.ndarray) -> None:
@@ -54,11 +48,7 @@ class FingerGaps:
         self._both_radii_m = radii.ravel()[self._first] + radii.ravel()[self._second]
 
     def gaps_m(self, joints_rad: np.ndarray) -> Float64[np.ndarray, "time pairs"]:
-        """Gap between the fingers of each of `pairs`, negative where they overlap.
-
-        Args:
-            joints_rad: [T, J] finite angles.
-        """
+        """Gap of each of `pairs` at finite angles [T, J], negative where fingers overlap."""
         points = self._hand.chain_points_m(joints_rad)
         starts, lines = points[:, :, :-1], np.diff(points, axis=2)
         last = lines[:, :, -1]
@@ -79,16 +69,9 @@ class FingerGaps:
     ) -> tuple[Float64[np.ndarray, " joints"], Bool[np.ndarray, " fingers"]]:
         """The angles after a step in which fingers stop before they are nearer than the clearance.
 
-        Fingers that do not come near each other move on. Fingers that are nearer from the
-        start may stay or move apart.
-
-        Args:
-            joints_rad: [J] finite angles before the step.
-            step_rad: [J] wanted change.
-            clearance_m: smallest gap; 0 lets fingers touch.
-
-        Returns:
-            The angles, between those before and after the whole step, and the stopped fingers.
+        Fingers that do not come near each other move on; those that are nearer from the start may
+        stay or move apart. `joints_rad` [J] are finite angles before the step of `step_rad` [J]; a
+        clearance of 0 lets fingers touch. Returns angles of the way, and which fingers stopped.
         """
         stops = np.ones(len(self._hand.fingers))
         if not step_rad.any():

@@ -18,7 +18,7 @@ from dextouch.schemas import Matrix
 from dextouch.tactile.layout import Side
 from services.alignment.retargeting import HandRetargeter, RetargetOptions, RetargetStatus
 from services.alignment.retargeting.hand_retargeter import calibrated_profile, measure_profile
-from services.alignment.retargeting.wrist_frame import (
+from services.alignment.retargeting.wrist import (
     calibrated_transform,
     calibration_name,
     hand_axes_check,
@@ -62,19 +62,12 @@ class HandSample:
 class Command:
     """Joint angles to go to within one period, and how they came about.
 
-    Attributes:
-        step: number of the command, from 0.
-        status: of the hand.
-        joints_rad: in the order of the hand's joints.
-        t_device_ns: of the sample that they follow; None before the first.
-        age_s: of this sample: how long ago it was received, and how long it had been on its way
-            beyond the usual; None before the first.
-        received_s: when it was received, if this is the first command after it.
-        finger_status: of retargeting, by finger.
-        tip_error_m: of retargeting, by finger.
-        lag_rad: largest distance of a joint from the angle that retargeting asks for.
-        at_limits: share of the joints that are at a limit of position.
-        stopped_fingers: those that would otherwise run into another one.
+    `step` counts commands from 0. `t_device_ns` is the time of the sample that they follow, and
+    `age_s` how long ago it was received and had been on its way beyond the usual; None before the
+    first. `received_s` is when it was received, if this is the first command after it. Status and
+    error of fingers are those of retargeting, `lag_rad` is the largest distance of a joint from the
+    angle that it asks for, `at_limits` the share of joints at a limit of position, and
+    `stopped_fingers` are those that would otherwise run into another one.
     """
 
     step: int
@@ -121,19 +114,9 @@ class HandFollower:
 
     Every command keeps these limits, whatever samples come or do not, and however late it is:
     joints are within the hand's limits; none goes further than its speed times the period from
-    the command before; fingers stop before they overlap.
-
-    Args:
-        side: of the hand, a Wuji Hand 2.
-        limits: of commands, and the watchdog's times.
-        rate_hz: of commands.
-        calibration: matrices of `calibration.json`: wrist axes and profile of the person.
-
-    Attributes:
-        refused: numbers of samples that were not followed, by reason.
-
-    Raises:
-        InvalidInputError, ShapeError: a calibration that is none.
+    the command before; fingers stop before they overlap. Of the calibration, the matrices of
+    `calibration.json`, it uses the person's wrist axes and profile, and raises InvalidInputError or
+    ShapeError if they are invalid. `refused` counts samples that were not followed, by reason.
     """
 
     def __init__(
@@ -157,14 +140,10 @@ class HandFollower:
         self.start(self._relaxed_rad)
 
     def start(self, joints_rad: np.ndarray) -> None:
-        """Begin where the motors are, which the first command repeats.
+        """Begin at the angles [J] that the robot measured, which the first command repeats.
 
-        Args:
-            joints_rad: [J], measured by the robot.
-
-        Raises:
-            InvalidInputError: not one finite angle a joint, or beyond a limit by more than a joint
-                may go in one period.
+        Raises InvalidInputError for not one finite angle a joint, or one that is beyond a limit by
+        more than a joint may go in one period.
         """
         joints = np.asarray(joints_rad, dtype=np.float64)
         if joints.shape != self._lower_rad.shape or not np.isfinite(joints).all():

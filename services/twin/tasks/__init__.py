@@ -47,10 +47,7 @@ def get_task(name: str) -> Task:
 
 
 def named_tasks(names: Iterable[str]) -> tuple[str, ...]:
-    """Names of tasks, each once, from names of tasks and of `TASK_SETS`.
-
-    Raises UnknownNameError for a name of neither.
-    """
+    """Names of tasks, each once, by task or `TASK_SETS`; raises UnknownNameError for others."""
     found: dict[str, None] = {}
     for name in names:
         if name not in TASK_SETS and name not in _TASKS:

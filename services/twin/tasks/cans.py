@@ -1,9 +1,4 @@
-"""Tasks with a can: four that start alike, and one in which it is grasped a second time.
-
-The four test whether a policy or a world model heeds the instruction: the first observation of a
-seed is the same in all of them, so only the instruction tells how heavy the can is and where it
-goes (held up, or moved to the left or right).
-"""
+"""Tasks with a can: four that differ by instruction alone at first, and one of two grasps."""
 
 from dataclasses import dataclass
 from typing import Final, Literal
@@ -14,8 +9,8 @@ from jaxtyping import Float64
 from dextouch.geometry import transform_from_pose
 from services.twin.demonstrators import NO_NOISE, HandPose, Waypoint, WaypointNoise, moved
 from services.twin.grasps import CylinderGrasp
-from services.twin.mjcf import numbers
 from services.twin.names import Domain
+from services.twin.scene import numbers
 from services.twin.simulation import Simulation
 from services.twin.tasks.task import Draw, Grip, Noise, Poses, at_rest, one_handed
 
@@ -170,10 +165,7 @@ class CanTask:
         )
 
     def reached(self, simulation: Simulation) -> tuple[bool, ...]:
-        """Touched; lifted by 3 cm; then raised by 8 cm and held, or over the mat, on it, released.
-
-        The whole can must stand on the mat.
-        """
+        """Touched; lifted by 3 cm; then raised by 8 cm and held, or over, on the mat, released."""
         touched = simulation.hand_touches(0)
         height_m = simulation.object_poses()[0, 2] - _HALF_LENGTH_M
         lifted = bool(touched and height_m > _LIFTED_M and not simulation.touches_table(0))
@@ -281,7 +273,6 @@ class RegraspCan:
         return bool(heights_m.size and heights_m.mean() < 0.0)
 
     def _is_set_down(self, simulation: Simulation) -> bool:
-        """Whether the can stands upright on the table, outside the stand."""
         T_world_can = transform_from_pose(simulation.object_poses()[_CAN])
         aside_m = np.abs(T_world_can[:2, 3] - simulation.object_poses()[_STAND, :2]).max()
         return bool(

@@ -8,8 +8,8 @@ from jaxtyping import Float64
 from dextouch.geometry import transform_from_pose
 from services.twin.demonstrators import NO_NOISE, Waypoint, moved
 from services.twin.grasps import CylinderGrasp
-from services.twin.mjcf import numbers
 from services.twin.names import Domain
+from services.twin.scene import numbers
 from services.twin.simulation import Simulation
 from services.twin.tasks.task import THUMB_UP, Draw, Grip, Noise, Poses, is_left, one_handed, yawed
 

@@ -10,8 +10,8 @@ from dextouch.geometry.rotations import quaternion_from_rotation
 from dextouch.tactile.layout import Side
 from services.twin.demonstrators import NO_NOISE, HandPose, Waypoint, WaypointNoise, bent, moved
 from services.twin.grasps import CylinderGrasp
-from services.twin.mjcf import numbers
 from services.twin.names import Domain
+from services.twin.scene import numbers
 from services.twin.simulation import Simulation
 from services.twin.tasks.task import SIGNS, THUMB_UP, Draw, Grip, Noise, Poses, is_left, yawed
 
@@ -54,7 +54,6 @@ def _yaw_rad(T: Float64[np.ndarray, "4 4"]) -> float:
 
 
 def _is_carried(simulation: Simulation, shoe_index: int) -> bool:
-    """Whether a hand holds a boot clear of table and rack."""
     height_m = simulation.object_poses()[shoe_index, 2]
     return bool(
         simulation.hand_touches(shoe_index)
@@ -190,10 +189,7 @@ class PlaceShoes:
         return all(_in_place(simulation)) and is_left(simulation)
 
     def reached(self, simulation: Simulation) -> tuple[bool, ...]:
-        """A boot touched; one, then both lifted or placed; one, then both placed; released.
-
-        A boot in its place counts as lifted, so that boots may be carried one after the other.
-        """
+        """A boot touched; one, both lifted or placed; one, both placed; released."""
         placed = _in_place(simulation)
         taken = [
             done or _is_carried(simulation, shoe)

@@ -7,8 +7,8 @@ from jaxtyping import Float64
 
 from dextouch.geometry import transform_from_pose
 from services.twin.demonstrators import HandPose, Waypoint
-from services.twin.mjcf import numbers
 from services.twin.names import Domain
+from services.twin.scene import numbers
 from services.twin.simulation import Simulation
 from services.twin.tasks.task import SIGNS, THUMB_UP, Draw, Noise, Poses, is_left, with_palm, yawed
 

@@ -9,8 +9,8 @@ from dextouch.geometry import transform_from_pose
 from dextouch.geometry.rotations import quaternion_from_rotation, rotation_from_vector
 from services.twin.demonstrators import NO_NOISE, HandPose, Waypoint, WaypointNoise, bent, moved
 from services.twin.grasps import CylinderGrasp
-from services.twin.mjcf import numbers
 from services.twin.names import Domain
+from services.twin.scene import numbers
 from services.twin.simulation import Simulation
 from services.twin.tasks.task import PALM_DOWN, Draw, Grip, Noise, Poses, is_left, one_handed, yawed
 

@@ -9,8 +9,8 @@ from dextouch.geometry import invert, transform, transform_from_pose
 from dextouch.geometry.rotations import quaternion_from_rotation
 from services.twin.demonstrators import NO_NOISE, HandPose, Waypoint, WaypointNoise, moved
 from services.twin.hands import twin_hand
-from services.twin.mjcf import numbers
 from services.twin.names import Domain
+from services.twin.scene import numbers
 from services.twin.simulation import Simulation
 from services.twin.tasks.task import PALM_DOWN, Draw, Noise, Poses, flat, is_left, one_handed, yawed
 

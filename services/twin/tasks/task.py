@@ -36,60 +36,37 @@ class Task(Protocol):
     @property
     def name(self) -> str:
         """Identifier, snake case."""
-        ...
 
     @property
     def instruction(self) -> str:
         """Instruction for an operator or a policy."""
-        ...
 
     @property
     def object_names(self) -> tuple[str, ...]:
         """Bodies of the task, in the order of poses."""
-        ...
 
     @property
     def milestones(self) -> tuple[str, ...]:
         """Milestones in order, snake case; the last one is success."""
-        ...
 
     def objects_mjcf(self) -> str:
-        """MJCF of the bodies, with geoms of class `object`.
-
-        Each has a free joint, or is a fixed `mocap="true"` body, or is attached to one by hinges or
-        slides; see `services.twin.scene`.
-        """
-        ...
+        """MJCF of the bodies, as `services.twin.scene` describes, with geoms of class `object`."""
 
     def place(self, generator: Draw) -> Poses:
         """T_world_object at the start, joints at rest: x y z (m), qw qx qy qz."""
-        ...
 
     def script(self, poses: Poses, domain: Domain, draw: Draw, noise: Noise) -> list[Waypoint]:
-        """Waypoints of the demonstrator.
+        """Waypoints of the demonstrator, who assumes these poses of the objects.
 
-        Args:
-            poses: those of the objects that the demonstrator assumes.
-            domain: robot or human hands.
-            draw: source of variations between takes that are independent of `noise`.
-            noise: errors at the first (grasp) and second (place) location. The first waypoint has
-                none.
+        `draw` is the source of variations between takes that are independent of `noise`, the errors
+        at the first (grasp) and second (place) location. The first waypoint has none.
         """
-        ...
 
     def succeeded(self, simulation: Simulation) -> bool:
-        """Whether the task is done now: objects in pose and at rest.
-
-        No hand touches them, unless the task is to hold them.
-        """
-        ...
+        """Whether objects are in pose, at rest and, unless they are to be held, untouched."""
 
     def reached(self, simulation: Simulation) -> tuple[bool, ...]:
-        """Whether the condition of each milestone holds now; the last one is `succeeded`.
-
-        Contacts of the simulation must be current, as at every grid step.
-        """
-        ...
+        """Whether each milestone's condition holds at a grid step; the last is `succeeded`."""
 
 
 def yawed(yaw_rad: float) -> Float64[np.ndarray, "3 3"]:
@@ -147,13 +124,9 @@ class Grip:
         side: Side = "right",
         held_m: Sequence[float] = (0.0, 0.0, 0.0),
     ) -> HandPose:
-        """The open hand at a cylinder.
+        """The open hand at a cylinder, whose axis is x of R_world_axis.
 
-        Args:
-            R: R_world_axis; x is the axis of the cylinder.
-            point_m: in the world.
-            side: of the hand.
-            held_m: what is at that point, in the frame of the cylinder.
+        What is at the point in the world is `held_m` in the frame of the cylinder.
         """
         R_world_wrist = R @ self._R_wrist_axis.T
         middle_m = self._grasp.axis_point_m(twin_hand(side, self._domain))

@@ -8,8 +8,8 @@ from jaxtyping import Float64
 from dextouch.geometry import transform_from_pose
 from dextouch.geometry.rotations import quaternion_from_rotation
 from services.twin.demonstrators import NO_NOISE, HandPose, Waypoint, WaypointNoise, moved
-from services.twin.mjcf import numbers
 from services.twin.names import Domain
+from services.twin.scene import numbers
 from services.twin.simulation import Simulation
 from services.twin.tasks import task
 

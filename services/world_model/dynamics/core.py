@@ -1,14 +1,8 @@
-"""Recurrent core: predicts object motion and touch from commanded hand motion.
+"""Recurrent core: predicts object motion and touch from commanded hand motion, for all tasks.
 
-A gated recurrent network (Cho et al. 2014) at 3.75 Hz that knows no tasks. Its inputs are the
-distances of hand points to the surface of every object at its predicted pose (`features`), so that
-predictions feed back; objects are described by their size and whether they move at all. An object
-moves with the left hand, with the right hand, or by itself, as three gates say. Hidden units stay
-within −1 … 1 and predicted positions within reach, so that what a rollout carries is bounded.
-
-Layers have separate weights for every member of an ensemble, computed for all members at once: at
-the sizes of a single rollout an ensemble costs about as much as one of its members. Inputs and
-outputs have one batch axis in which each member's entries follow each other, as many of each.
+A gated recurrent network (Cho et al. 2014) at 3.75 Hz on distances of hand points to objects at
+their predicted poses. Layers have weights for every member of an ensemble, whose entries follow
+each other on the batch axis: an ensemble costs a rollout about as much as one member.
 """
 
 from dataclasses import dataclass
@@ -83,11 +77,7 @@ class SceneStart:
 
 @dataclass(frozen=True)
 class CoreState:
-    """What a core carries from one latent step to the next, per entry.
-
-    The hidden units, the objects' predicted poses (`axes` orthonormal), and the wrists' last
-    position and axes.
-    """
+    """What a core carries between latent steps; `axes` of the predicted poses are orthonormal."""
 
     hidden: Float32[Tensor, "*batch width"]
     position_m: Float32[Tensor, "*batch objects 3"]
@@ -162,10 +152,7 @@ class MemberGRU(nn.Module):
 
 
 class RecurrentCore(nn.Module):
-    """Predicts object poses and touch from commands and a start.
-
-    Entries of the ensemble's first member come first, then those of the second, and so on.
-    """
+    """Predicts object poses and touch from commands and a start; entries go member by member."""
 
     boxes_m: Tensor
     movable: Tensor
@@ -231,10 +218,7 @@ class RecurrentCore(nn.Module):
     def distance(
         self, commands: Commands, before_m: Float32[Tensor, "batch 2 3"]
     ) -> Float32[Tensor, "batch latents"]:
-        """Mean excess of the hands' own features over their range in training; 0 inside it.
-
-        `before_m` are the wrists' positions before the commands.
-        """
+        """Mean excess of the hands' features over their range in training, from `before_m` on."""
         wrist_m = torch.cat([before_m[:, None], commands.points_m[:, :, -1, :, 0]], dim=1)
         own = own_features(commands, wrist_m)
         beyond = (own - self.highest).clamp_min(0.0) + (self.lowest - own).clamp_min(0.0)
@@ -278,8 +262,8 @@ class RecurrentCore(nn.Module):
     ) -> tuple[SceneFuture, CoreState]:
         """Predictions for every latent, and the state after the last one.
 
-        `start` is the same for all chunks of a rollout, `state` is from `first_state` or from the
-        previous chunk, and `human` as for `first_state`.
+        `state` is from `first_state`, as is `human`, or from the previous chunk; `start` stays the
+        same.
         """
         flags = self._flags(start, human)
         # Slots that no entry of the batch uses need no computation.
@@ -360,10 +344,7 @@ class RecurrentCore(nn.Module):
 
 
 def direction_free_inputs(width: int) -> list[int]:
-    """Inputs of the estimate of success that are lengths, heights and angles.
-
-    The hidden state, of this width, comes first.
-    """
+    """Inputs of the estimate of success that are lengths, heights and angles, by a core's width."""
     of_pairs = width + MAX_OBJECTS * _END_SIZE
     of_objects = range(width, of_pairs, _END_SIZE)
     pairs = range(of_pairs, of_pairs + len(_PAIRS) * _PAIR_SIZE, _PAIR_SIZE)
@@ -394,10 +375,7 @@ def _moved(
     moves: Float32[Tensor, "batch objects"],
     wrists: tuple[Tensor, Tensor, Tensor],
 ) -> tuple[Tensor, Tensor]:
-    """Positions and rotations after a latent step: with the hands as the gates say, and by itself.
-
-    Rotations are blended as matrices and made orthonormal again.
-    """
+    """Poses after a latent step, moved with the hands as the gates say, and by themselves."""
     position, R = poses
     before_m, after_m, turn = wrists
     share = output[..., :3].softmax(-1)[..., :2].transpose(1, 2)[..., None]
@@ -428,24 +406,20 @@ def _ending_features(
     """
     z, x = axes.unbind(-2)
     R = torch.stack([x, torch.linalg.cross(z, x), z], dim=-1)
-    each = torch.cat([about, axes.flatten(3), compressed(position), _across_and_up(way)], dim=-1)
-    parts = [(each * present[..., None]).flatten(2)]
+    lengths = torch.cat([way[..., :2].norm(dim=-1, keepdim=True), way[..., 2:]], dim=-1)
+    each = [about, axes.flatten(3), compressed(position), compressed(lengths)]
+    parts = [(torch.cat(each, dim=-1) * present[..., None]).flatten(2)]
     for a, b in _PAIRS:
-        apart = position[..., b, :] - position[..., a, :]
+        a_to_b = position[..., b, :] - position[..., a, :]
         from_a, from_b = (
             torch.einsum("bli,blij->blj", offset, R[..., index, :, :])
-            for offset, index in ((apart, a), (-apart, b))
+            for offset, index in ((a_to_b, a), (-a_to_b, b))
         )
         cosines = [(one[..., a, :] * one[..., b, :]).sum(-1, keepdim=True) for one in (z, x)]
-        distances = [_with_length_across(apart), _with_length_across(from_a), compressed(from_b)]
+        distances = [_with_length_across(a_to_b), _with_length_across(from_a), compressed(from_b)]
         there = present[..., a, None] * present[..., b, None]
         parts.append(torch.cat([*distances, *cosines], dim=-1) * there)
     return torch.cat(parts, dim=-1)
-
-
-def _across_and_up(offset_m: Float32[Tensor, "*batch 3"]) -> Float32[Tensor, "*batch 2"]:
-    across_m = offset_m[..., :2].norm(dim=-1, keepdim=True)
-    return compressed(torch.cat([across_m, offset_m[..., 2:]], dim=-1))
 
 
 def _with_length_across(offset_m: Float32[Tensor, "*batch 3"]) -> Float32[Tensor, "*batch 4"]:

@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 import torch
-from jaxtyping import Float32, Float64, Shaped
+from jaxtyping import Float, Float32, Float64, Shaped
 from pydantic import Field, model_validator
 from torch import Tensor, nn
 from torch.nn import functional
@@ -81,9 +81,7 @@ class HandMotion:
 def hand_motion(
     actions: Float64[np.ndarray, "n 67"], anchor: AnchorPoses, *, validated: bool = False
 ) -> HandMotion:
-    """Motion of both hands under actions relative to `anchor`.
-
-    With `validated`, `check_actions` has returned the actions, and they are not checked again.
+    """Motion of both hands under actions relative to `anchor`, which may be `validated` already.
 
     Raises:
         DegenerateRotationError: the actions contain a degenerate rotation.
@@ -107,11 +105,7 @@ def hand_motion(
 
 
 def compressed(distance_m: Float32[Tensor, "..."]) -> Float32[Tensor, "..."]:
-    """asinh(d / 1 cm) / 2: linear near zero, logarithmic far away.
-
-    Success is decided within millimetres: one near an object and a decimetre far from it both
-    change a feature by about a tenth. The scale is the same for all tasks.
-    """
+    """asinh(d / 1 cm) / 2: linear near zero, where success is decided, logarithmic far away."""
     return torch.asinh(distance_m / NEAR_M) / 2
 
 
@@ -198,10 +192,7 @@ class DynamicsConfig(FrozenModel):
 
 
 def subwords(instruction: str) -> list[str]:
-    """Each word and its trigrams, in lower case with a mark at both ends; at most 160.
-
-    Words of one stem share trigrams, and words that share a bucket by chance differ by theirs.
-    """
+    """Each word and its trigrams, which words of one stem share, in lower case; at most 160."""
     parts = []
     for word in WORD.findall(instruction.lower()):
         marked = f"<{word}>"
@@ -228,11 +219,7 @@ def instruction_features(
 
 @dataclass(frozen=True)
 class Commands:
-    """Motion of both hands at the sampled steps of each latent.
-
-    `points_m` are those of `HandMotion` at the `SAMPLE_OFFSETS` of each latent, `axes` and
-    `joints_rad` at its end.
-    """
+    """Hands at the `SAMPLE_OFFSETS` of each latent (`points_m` of `HandMotion`), and at its end."""
 
     points_m: Float32[Tensor, "batch latents samples 2 points 3"]
     axes: Float32[Tensor, "batch latents 2 6"]
@@ -310,33 +297,21 @@ def objects_from_poses(poses: Shaped[np.ndarray, "*batch objects 7"]) -> ObjectP
 
 
 def poses_from_objects(objects: ObjectPoses) -> Float64[np.ndarray, "*batch objects 7"]:
-    """Rigid poses nearest to predicted positions and axes.
+    """Rigid poses nearest to predicted ones: z keeps its direction, x is made perpendicular to it.
 
-    z keeps its direction; x is made perpendicular to it. Where x is unknown (near zero or along
-    z), any perpendicular direction is taken, as for an object that is symmetric about z.
+    Where x is unknown (near zero or along z), any perpendicular direction is taken.
     """
-    axes = objects.axes.double().numpy()
-    z = _unit(axes[..., 0, :], np.array([0.0, 0.0, 1.0]))
-    x = axes[..., 1, :] - z * (axes[..., 1, :] * z).sum(-1, keepdims=True)
-    helper = np.where(np.abs(z[..., :1]) < 0.9, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
-    fallback = helper - z * (helper * z).sum(-1, keepdims=True)
-    fallback /= np.linalg.norm(fallback, axis=-1, keepdims=True)
-    x = _unit(x, fallback)
-    R = np.stack([x, np.cross(z, x), z], axis=-1)
+    R = rotations(objects.axes.double()).numpy()
     return pose_from_transform(transform(R, objects.position_m.double().numpy()))
 
 
-def rotations(axes: Float32[Tensor, "*batch 2 3"]) -> Float32[Tensor, "*batch 3 3"]:
-    """R_world_object nearest to predicted axes: z keeps its direction, x is made perpendicular.
-
-    As `poses_from_objects`, for networks. Axes of no length give some rotation.
-    """
-    z = _direction(axes[..., 0, :], torch.tensor([0.0, 0.0, 1.0]))
+def rotations(axes: Float[Tensor, "*batch 2 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """R_world_object nearest to predicted axes, as of `poses_from_objects`."""
+    along, across, up = torch.eye(3, dtype=axes.dtype)
+    z = _direction(axes[..., 0, :], up)
     x = axes[..., 1, :]
     x = x - z * (x * z).sum(-1, keepdim=True)
-    helper = torch.where(
-        z[..., :1].abs() < 0.9, torch.tensor([1.0, 0.0, 0.0]), torch.tensor([0.0, 1.0, 0.0])
-    )
+    helper = torch.where(z[..., :1].abs() < 0.9, along, across)
     x = _direction(x, functional.normalize(helper - z * (helper * z).sum(-1, keepdim=True), dim=-1))
     return torch.stack([x, torch.linalg.cross(z, x), z], dim=-1)
 
@@ -346,18 +321,10 @@ def _direction(vectors: Tensor, otherwise: Tensor) -> Tensor:
     return torch.where(length > _SHORTEST, vectors / length.clamp_min(_SHORTEST), otherwise)
 
 
-def _unit(vectors: np.ndarray, otherwise: np.ndarray) -> np.ndarray:
-    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return np.where(length > _SHORTEST, vectors / np.maximum(length, _SHORTEST), otherwise)
-
-
 def principal_axes(
     second_moment: Float64[Tensor, "dim dim"], num_channels: int
 ) -> tuple[Float32[Tensor, "dim channels"], Float32[Tensor, " channels"]]:
-    """Strongest eigenvectors, strongest first, and the root mean square along each.
-
-    Each vector's largest entry is made positive, so that equal data give an equal basis.
-    """
+    """Strongest eigenvectors, of positive largest entries, and the root mean square along each."""
     # Of data that touch few taxels, whose other rows are zero, torch's solver (MKL) can fail.
     values, vectors = map(torch.from_numpy, np.linalg.eigh(second_moment.numpy()))
     basis = vectors[:, -num_channels:].flip(1)
@@ -368,11 +335,7 @@ def principal_axes(
 
 
 def root_scale(rms: Float32[Tensor, " channels"]) -> Float32[Tensor, " channels"]:
-    """Divisors that give channel c the amplitude sqrt(rms_c / rms_0).
-
-    Full whitening would give the weakest channels, mostly noise, as much weight as the strongest;
-    without whitening the strongest would dominate.
-    """
+    """Divisors for amplitudes sqrt(rms_c / rms_0), between no and full whitening."""
     strongest = rms[0].clamp_min(1e-6)
     return torch.sqrt((rms / strongest).clamp_min(MIN_RELATIVE_SCALE)) * strongest
 
@@ -403,10 +366,7 @@ class TouchCodec(nn.Module):
     def fit(
         self, tactile_kpa: Float32[Tensor, "n taxels"], *, peak_kpa: float | None = None
     ) -> None:
-        """Fit axes and scale to a sample of training touch of single hands.
-
-        `peak_kpa` is the highest pressure of all training data; None uses that of the sample.
-        """
+        """Fit to touch of single hands; `peak_kpa` is by default that of the sample."""
         roots = root_pressure(tactile_kpa).double()
         # Not centred: the mean touch is not a touch that occurs.
         basis, rms = principal_axes(roots.T @ roots / len(roots), self.basis.shape[1])

@@ -1,8 +1,4 @@
-"""Dynamics model: an ensemble of start readers and recurrent cores that share a touch codec.
-
-The only state kept between chunks is a `SceneMemory`, which is batched, unbatched and serialized
-here, too.
-"""
+"""Dynamics model: an ensemble of start readers and recurrent cores that share a touch codec."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -73,11 +69,7 @@ _RANGES = {
 
 @dataclass(frozen=True)
 class Stillness:
-    """Latent steps in which the hands move, and in which the scene is at rest.
-
-    `points_m` are the hand points when they last moved, `num_still` the number of latent steps
-    since then, both after the last latent step.
-    """
+    """Latent steps in which hands move or the scene rests; `points_m` when they last moved."""
 
     points_m: Float32[Tensor, "batch 2 points 3"]
     num_still: Int64[Tensor, " batch"]
@@ -101,8 +93,7 @@ def stillness(
     """Track hands that have stood at `points_m` for `num_still` latent steps.
 
     Hands move when they leave that position, however slowly. A scene is at rest in latent steps
-    without motion that follow `REST_LATENTS` such steps. Latent steps are counted, not chunks, so
-    that a client may split its commands as it likes.
+    without motion that follow `REST_LATENTS` such steps, however commands are split into chunks.
     """
     moved, rested = [], []
     for samples_m in commanded_m.unbind(1):
@@ -122,8 +113,7 @@ def by_pad(
 ) -> Float[np.ndarray, "*batch 12"]:
     """One pressure a pad: thumb … little fingertip and palm of the left hand, then of the right.
 
-    `reduce` takes the taxels of a pad and an axis, such as `np.mean`. A part of the hand without
-    taxels has the pressure 0.
+    `reduce` takes taxels and an axis, such as `np.mean`; a part of the hand without taxels has 0.
     """
     return layout.by_part(tactile_kpa, reduce).reshape(*tactile_kpa.shape[:-2], NUM_PADS)
 
@@ -239,10 +229,9 @@ class DynamicsModel(nn.Module):
 
     @torch.no_grad()
     def advance(self, memory: SceneMemory, commands: Commands) -> tuple[SceneMemory, ImaginedSteps]:
-        """Predict the steps that follow from commands.
+        """Predict the steps that follow from commands, however they are split over calls.
 
-        Entries whose hands have stood still for two seconds, and still do, are at rest: poses and
-        touch stay constant. Splitting commands over several calls does not change the result.
+        Poses and touch stay constant where hands have stood still for two seconds, and still do.
         """
         still = stillness(memory.points_m, memory.num_still, commands.points_m)
         parts: list[_Run] = []
@@ -317,10 +306,7 @@ class DynamicsModel(nn.Module):
         touch: Float32[Tensor, "*batch 2 channels"],
         taxels: Float32[Tensor, "*batch 2 taxels"],
     ) -> Float32[Tensor, "*batch 2 taxels"]:
-        """Pressures in kPa from latents and from contact log odds of each taxel.
-
-        Taxels in contact have at least the contact threshold pressure, all others have none.
-        """
+        """Pressures (kPa): of taxels in contact at least the contact threshold, of others 0."""
         touches = taxels > CONTACT_LOG_ODDS
         return self.codec.decode(touch).clamp_min(CONTACT_THRESHOLD_KPA) * touches
 
@@ -402,8 +388,7 @@ def memory_from_arrays(
     """Inverse of `memory_arrays`; validates untrusted arrays.
 
     Raises:
-        InvalidInputError: missing arrays, wrong shapes or dtypes, or a task that the model does
-            not have.
+        InvalidInputError: missing arrays, wrong shapes or dtypes, or an unknown task.
         NonFiniteError: NaN or infinity.
     """
     memory = named(

@@ -1,9 +1,8 @@
 """Start reader: object poses of a task from one head image, touch and hand poses.
 
-A small convolutional network with feature points (spatial soft-argmax, Levine et al. 2016)
-predicts a pixel and a height for every object; the position is where the pixel's ray reaches that
-height, so that the known camera pose is used exactly. A second network looks at a crop about every
-such pixel, and at where the hands are from there, and corrects it.
+A convolutional network with feature points (spatial soft-argmax, Levine et al. 2016) predicts a
+pixel and a height for every object; the position is where the pixel's ray reaches that height. A
+second network corrects it from a crop about the pixel.
 """
 
 from dataclasses import dataclass
@@ -57,11 +56,7 @@ class FirstStep:
 
 @dataclass(frozen=True)
 class Reading:
-    """Objects of one observed step, and the uncertainty of each position.
-
-    `sd_m` is the predicted standard deviation of the position on each axis of the table; `size`
-    are factors of each object's usual width and height.
-    """
+    """Objects of one step; `sd_m` on each axis of the table, factors of usual width and height."""
 
     objects: ObjectPoses
     sd_m: Float32[Tensor, "batch objects"]
@@ -69,11 +64,7 @@ class Reading:
 
 
 class StartReader(nn.Module):
-    """Predicts object poses, sizes, their uncertainty and presence from one observed step.
-
-    Channels of the image are standardized, so that exposure, gain and the colour of the light have
-    no effect.
-    """
+    """Predicts objects from one observed step, whatever the exposure and colour of the light."""
 
     height_mean: Tensor
 
@@ -196,10 +187,7 @@ def ray_at_height(
     K_head: Float32[Tensor, "batch 3 3"],
     T_world_camera: Float32[Tensor, "batch 4 4"],
 ) -> Float32[Tensor, "batch objects 3"]:
-    """World point (m) where a pixel's ray reaches a height, within `MAX_DISTANCE_M` on each axis.
-
-    Rays that look up or almost along the horizon are tilted to meet the height far away.
-    """
+    """World point (m) where a pixel's ray, tilted if it is flat, reaches a height."""
     focal = torch.stack([K_head[:, 0, 0], K_head[:, 1, 1]], dim=-1)[:, None]
     centre = K_head[:, None, :2, 2]
     flat = (pixel - centre) / focal

@@ -35,10 +35,7 @@ _Rows = Float[Tensor, "*batch width"]
 
 @cache
 def left_joint_signs() -> Float64[np.ndarray, "20"]:
-    """Signs that map left joint angles to those of the mirrored right joints.
-
-    A mirror maps an axis a to -S a; the sign says whether that is the right hand's axis.
-    """
+    """Signs that map left joint angles to those of the right hand, by mirrored axes."""
     axes = [
         np.array([joint.axis for finger in RobotHand(side).fingers for joint in finger.joints])
         for side in ("left", "right")
@@ -85,21 +82,14 @@ def video_positions(num_latents: int, side: int) -> Float32[Tensor, "tokens 3"]:
 
 
 def tactile_positions(num_steps: int, tokens_per_step: int) -> Float32[Tensor, "tokens 3"]:
-    """Positions of tactile tokens, step by step.
-
-    They lie on the time axis of the video, at a quarter of a latent per step, so that step 4j has
-    the time of latent j, which ends with it. They have no place in the image: row and column are 0.
-    """
+    """Positions of tactile tokens: a quarter of a latent apart, at row and column 0."""
     positions = torch.zeros(num_steps, tokens_per_step, 3)
     positions[..., 0] = torch.arange(num_steps)[:, None] / FRAMES_PER_LATENT
     return positions.flatten(0, 1)
 
 
 def angles(positions: Float32[Tensor, "tokens 3"], head_width: int) -> Float32[Tensor, "tokens n"]:
-    """Angle of each pair of a head's values; rows and columns take two sixths of the width each.
-
-    Computed in float64, since angles grow with time.
-    """
+    """Angle of each pair of a head's values; rows and columns take two sixths of the width each."""
     spatial = 2 * (head_width // 6)
     parts = []
     for axis, width in enumerate((head_width - 2 * spatial, spatial, spatial)):
@@ -121,10 +111,7 @@ class ActionTokens(nn.Module):
 
     def __init__(self, *, num_steps: int, width: int) -> None:
         super().__init__()
-        self.parts = nn.ModuleList(
-            nn.Sequential(nn.Linear(dim, width), nn.SiLU(), nn.Linear(width, width))
-            for dim in PART_DIMS
-        )
+        self.parts = nn.ModuleList(two_layers(dim, width, width) for dim in PART_DIMS)
         self.steps = nn.Parameter(0.02 * torch.randn(num_steps, 1, width))
 
     def forward(
@@ -140,9 +127,8 @@ class ActionAttention(nn.Module):
     """Attention of each group of tokens to the action tokens of that group, instead of AdaLN.
 
     Dual rate (equation 4 of the paper): tokens of video latent j attend to the actions 4j-3 … 4j,
-    those of tactile step t to action t, and those of index 0 to nothing. Every action is three
-    tokens: own hand, other hand and camera. There are no biases, so that action tokens of zero
-    (index 0) change nothing.
+    those of tactile step t to action t, and those of index 0 to nothing, which is without biases no
+    change.
     """
 
     def __init__(self, *, width: int, num_heads: int, head_width: int) -> None:
@@ -182,8 +168,8 @@ class KeysValues:
 class Text:
     """Embedded words that video tokens attend to; `kept` has their keys and values by layer.
 
-    They do not depend on the flow time, so that the steps of a sampler can share one object. The
-    keys and values of a batch may come from texts of single `rows`, which other batches share.
+    Steps of a sampler share one object; a batch may be of texts of single `rows`, which others
+    share.
     """
 
     words: Float[Tensor, "batch words width"]
@@ -242,10 +228,7 @@ class Stream:
 
 
 def clean_mask(is_clean: Bool[Tensor, " tokens"]) -> Bool[Tensor, "tokens tokens"]:
-    """Attention mask: clean queries attend to clean keys only, noisy queries to all keys.
-
-    Clean context therefore never depends on noise. Every query attends at least to itself.
-    """
+    """Attention mask: clean queries attend to clean keys only, noisy queries to all keys."""
     return ~is_clean[:, None] | is_clean[None, :]
 
 
@@ -309,11 +292,7 @@ class ExpertBlock(Block):
 
 
 class JointLayer(nn.Module):
-    """One layer: two expert blocks around one attention, or the video block alone.
-
-    Mixture-of-Transformers: each stream has its own projections, norms, modulation and feed-forward
-    network; only the attention is shared, over the tokens of both.
-    """
+    """One layer: two expert blocks around one shared attention, or the video block alone."""
 
     def __init__(self, video: Block, tactile: Block | None) -> None:
         super().__init__()
@@ -347,11 +326,7 @@ class JointLayer(nn.Module):
     def update_after(
         self, past: KeysValues | None, video: Stream, tactile: Stream | None
     ) -> tuple[Stream, Stream | None, KeysValues]:
-        """Update tokens that attend to all of each other and of `past`.
-
-        Returns:
-            Both streams, and the keys and values that their tokens attended to.
-        """
+        """Update tokens that attend to each other and `past`; also returns keys and values."""
         query, key, value = self._queries_keys_values(video, tactile)
         if past is not None:
             key = torch.cat([past.keys, key], dim=2)
@@ -383,6 +358,13 @@ class JointLayer(nn.Module):
 def modulated_norm(tokens: _Rows, shift: _Rows, scale: _Rows) -> _Rows:
     """Layer norm without learned weights, then scale and shift by the condition (AdaLN)."""
     return functional.layer_norm(tokens, tokens.shape[-1:]) * (1.0 + scale) + shift
+
+
+def two_layers(in_width: int, hidden_width: int, out_width: int) -> nn.Sequential:
+    """Linear, SiLU, linear."""
+    return nn.Sequential(
+        nn.Linear(in_width, hidden_width), nn.SiLU(), nn.Linear(hidden_width, out_width)
+    )
 
 
 def zero_linear(in_width: int, out_width: int) -> nn.Linear:

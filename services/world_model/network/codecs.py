@@ -31,8 +31,8 @@ _Frames = Float[Tensor, "batch _channels _frames _rows _columns"]
 class VisualCodec(nn.Module):
     """Linear tokenizer of 1 + 4k images by principal axes of 8×8×4 patches, in closed form.
 
-    The first image forms a group of its own (repeated four times), followed by groups of four. A
-    token covers two by two patches of one latent frame. Frozen once fitted on training images.
+    The first image, four times, is a group of its own. A token covers two by two patches of one
+    latent frame.
     """
 
     mean: Tensor
@@ -82,11 +82,7 @@ class VisualCodec(nn.Module):
         return torch.cat([first, images[:, 1:].flatten(1, 2)], dim=1).clamp(0.0, 1.0)
 
     def decode_future(self, latents: Latents, *, all_images: bool) -> _Shown:
-        """Images after the first, or those of the last latent only.
-
-        The last latent is decoded separately, so that its images are bit-identical whether or not
-        the others are decoded.
-        """
+        """Images after the first, or of the last latent, decoded apart to be bit-identical."""
         images = self.decode(latents[:, [0, -1]])[:, 1:]
         if all_images and latents.shape[1] > 2:
             images = torch.cat([self.decode(latents[:, :-1])[:, 1:], images], dim=1)
@@ -132,11 +128,9 @@ def to_uint8(images: Float32[Tensor, "..."]) -> UInt8[Tensor, "..."]:
 class WanVideoCodec(nn.Module):
     """The video autoencoder of Wan2.2, frozen; tokens are two by two normalized latents each.
 
-    It maps 1 + 4k images to 1 + k latent frames of 48 channels at a sixteenth of the resolution. It
-    is causal: a latent frame depends on earlier images only, and an image on earlier latents only.
-
-    `window` is the number of latents that an image is decoded from, and `tile_px` the side of the
-    tiles that images are decoded in; None for all latents and whole images.
+    1 + 4k images are 1 + k latent frames of 48 channels at a sixteenth of the resolution. `window`
+    is the number of latents that an image is decoded from, and `tile_px` the side of the tiles that
+    images are decoded in; None for all latents and whole images.
     """
 
     def __init__(self, wan: WanConfig) -> None:
@@ -210,10 +204,9 @@ def last_images(
 ) -> Float[Tensor, "batch 3 shown height width"]:
     """The last images of a video in -1 … 1, by diffusers' decoder, to rounding.
 
-    Latents are decoded one after another, with the decoder's cache of earlier frames. In the last
-    block and the head, at the full resolution, only those frames are computed that the images
-    depend on: three convolutions of three frames a block reach back two frames each. Blocks before
-    them need every latent. At full size this saves 16.5 % of the decoder's work.
+    In the last block and the head, at the full resolution, only those frames are computed that the
+    images depend on: three convolutions of three frames a block reach back two frames each. At full
+    size this saves 16.5 % of the decoder's work.
     """
     from diffusers.models.autoencoders.autoencoder_kl_wan import unpatchify
 
@@ -279,8 +272,7 @@ class _LastFrames:
 def _statistics(
     like: Float[Tensor, "batch channels latents rows columns"],
 ) -> tuple[Float[Tensor, "channels 1 1 1"], Float[Tensor, "channels 1 1 1"]]:
-    values = (like.new_tensor(constant).view(-1, 1, 1, 1) for constant in (LATENT_MEAN, LATENT_STD))
-    mean, std = values
+    mean, std = like.new_tensor((LATENT_MEAN, LATENT_STD)).view(2, -1, 1, 1, 1)
     return mean, std
 
 

@@ -1,8 +1,7 @@
 """Conditions of the experts: flow time, actions, instruction, action kind and scene.
 
-They are vectors that modulate the experts (AdaLN); with `action_conditioning` "cross_attention" the
-actions are tokens instead. Dual rate (equation 4 of the paper): video latent j is conditioned on
-a[4j-3 … 4j], tactile step t on a_t, and index 0 on zeros.
+Dual rate (equation 4 of the paper): video latent j is conditioned on a[4j-3 … 4j], tactile step t
+on a_t, and index 0 on zeros.
 """
 
 import math
@@ -17,6 +16,7 @@ from services.world_model.network.attention import (
     HAND_DIM,
     ActionTokens,
     split_axis,
+    two_layers,
     zero_linear,
 )
 from services.world_model.network.configuration import FRAMES_PER_LATENT, NetworkConfig
@@ -36,10 +36,7 @@ _TYPICAL_LAYOUT = torch.tensor([0.0, 0.0, 0.5] + [0.0] * 6)
 
 @dataclass(frozen=True)
 class ActionFeatures:
-    """Normalized actions as each hand sees them: own, other, camera.
-
-    `past` are those at the past images, as the right hand sees them, with the age.
-    """
+    """Normalized actions as each hand sees them (own, other, camera); `past` is the right one's."""
 
     per_hand: Float32[Tensor, "batch time 2 67"]
     layout: Float32[Tensor, "batch 2 18"]
@@ -105,11 +102,7 @@ class TimeEmbedding(nn.Module):
 
 @dataclass(frozen=True)
 class Condition:
-    """What a group of tokens (a latent frame, or a step and hand) depends on.
-
-    `vector` modulates the layer norms; `actions` are tokens for cross-attention, if that is how
-    actions enter, flat over the groups.
-    """
+    """What a group of tokens depends on: modulation of norms, tokens for cross-attention."""
 
     vector: Float[Tensor, "batch *groups width"]
     actions: Float[Tensor, "batch groups keys width"] | None = None
@@ -275,13 +268,6 @@ class SceneEncoder(nn.Module):
         views = torch.cat([both, split_axis(ends, 0, (-1, 2))], dim=2)
         views = torch.stack([views[:, 0].flip(-1), views[:, 1]], dim=1)
         return split_axis(self.layers(views.flatten(0, 1)), 0, (-1, 2))
-
-
-def two_layers(in_width: int, hidden_width: int, out_width: int) -> nn.Sequential:
-    """Linear, SiLU, linear."""
-    return nn.Sequential(
-        nn.Linear(in_width, hidden_width), nn.SiLU(), nn.Linear(hidden_width, out_width)
-    )
 
 
 def without_dropped(

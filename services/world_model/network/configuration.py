@@ -1,6 +1,6 @@
-"""Shape and sampling of the joint model, stored in its checkpoint, and of the Wan2.2 networks."""
+"""Shapes of the joint model, of the Wan2.2 networks and of the renderer, stored in checkpoints."""
 
-from functools import cached_property
+from functools import cache
 from operator import not_
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
@@ -15,13 +15,12 @@ if TYPE_CHECKING:
     import torch
 
     from dextouch.tactile.layout import TactileLayout
-
-
 Sampler = Literal["euler", "unipc"]
 Precision = Literal["float32", "bfloat16"]
 TokenizerName = Literal["principal_axes", "split_hands", "grid"]
 FurtherView = Literal["camera_wrist_left", "camera_wrist_right"]
 PastChoice = Literal["nearest", "recent"]
+Interpolation = Literal["bilinear", "bicubic"]
 FRAMES_PER_LATENT = 4
 RASTER_CELLS_PER_TOKEN = 4
 # Fixed by the published autoencoder: it maps 1 + 4k images to 1 + k latents at a sixteenth of the
@@ -228,25 +227,17 @@ class NetworkConfig(FrozenModel):
     )
     model_rate_hz: float = Field(default=15.0, gt=0, description="steps per second")
     wan: WanConfig | None = Field(default=None, description="sizes of Wan2.2 for its video expert")
+    # Of another glove than `dextouch_v1`; training data say it.
+    layout: CliSuppress[LayoutDescription | None] = Field(default=None, exclude_if=not_)
 
     @property
     def tactile_layout(self) -> "TactileLayout":
         """Layout of the taxels that the network feels."""
-        from dextouch.tactile.layout import DEXTOUCH_V1  # not for a parser
-
-        return DEXTOUCH_V1
+        return _layout(self.layout)
 
     def with_layout(self, layout: "TactileLayout") -> "NetworkConfig":
         """The configuration of a network for the taxels of another glove."""
-        from dextouch.tactile.layout import DEXTOUCH_V1  # not for a parser
-
-        if layout == self.tactile_layout:
-            return self
-        known = {name: getattr(self, name) for name in NetworkConfig.model_fields}
-        if layout == DEXTOUCH_V1:
-            return NetworkConfig.model_construct(self.model_fields_set - {"layout"}, **known)
-        fields_set = self.model_fields_set | {"layout"}
-        return GloveNetworkConfig.model_construct(fields_set, **known, layout=layout)
+        return self.model_copy(update={"layout": None if layout == _layout(None) else layout})
 
     @model_validator(mode="after")
     def _sizes_fit(self) -> "NetworkConfig":
@@ -336,25 +327,31 @@ class NetworkConfig(FrozenModel):
         """Channels of one visual token: four patches."""
         return 4 * self.codec_channels
 
-    @property
-    def max_latents(self) -> int:
-        """Latent frames of the longest window."""
-        return num_latents(self.max_steps)
-
 
 def num_latents(num_steps: int) -> int:
     """Latent frames of 1 + 4k steps: the first step alone, then groups of four."""
     return 1 + (num_steps - 1) // FRAMES_PER_LATENT
 
 
-class GloveNetworkConfig(NetworkConfig):
-    """Shape of a joint model of a glove other than `dextouch_v1`; training data say its layout."""
+@cache
+def _layout(description: LayoutDescription | None) -> "TactileLayout":
+    from dextouch.tactile.layout import DEXTOUCH_V1, TactileLayout  # not for a parser
 
-    layout: LayoutDescription
+    known = None if description is None else description.model_dump()
+    return DEXTOUCH_V1 if known is None else TactileLayout.model_validate(known)
 
-    @cached_property
-    def tactile_layout(self) -> "TactileLayout":
-        """Layout of the taxels that the network feels."""
-        from dextouch.tactile.layout import TactileLayout  # not for a parser
 
-        return TactileLayout.model_validate(self.layout.model_dump())
+class RendererConfig(FrozenModel):
+    """Shape of the renderer's network; image sides must be divisible by 2^(number of widths)."""
+
+    widths: tuple[int, ...] = Field(
+        default=(32, 64, 96), min_length=1, max_length=4, description="channels at 1/2, 1/4, …"
+    )
+    depths: tuple[int, ...] = Field(
+        default=(1, 1, 2), min_length=1, max_length=4, description="residual blocks per level"
+    )
+    stem_px: int = Field(default=1, ge=1, le=5, description="kernel size of the first convolution")
+    interpolation: Interpolation = Field(default="bicubic", description="of the warped start image")
+    redraws_table: bool = Field(
+        default=True, description="redraw the whole image when only the camera moves"
+    )

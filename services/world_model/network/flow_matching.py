@@ -1,10 +1,8 @@
 """Flow matching (Lipman et al. 2023): noisy latents for training, and sampling.
 
 Straight paths: x_t = (1 - t) x_0 + t ε, t from 0 (data) to 1 (noise). The network predicts x_0, or
-the velocity v = ε - x_0 = (x_t - x_0) / t, whose squared error is that of x_0 over t². The last
-step of either solver returns the predicted x_0 exactly. Both write a step with the share `keep` =
-t' / t of the noisy sample that remains. For straight paths that is the exact solution for a
-constant prediction, without a logarithm, so that t = 1 and t' = 0 are exact.
+the velocity v = ε - x_0. Solvers write a step with the share t' / t of the noisy sample that
+remains, so that t = 1 and t' = 0 are exact.
 """
 
 import math
@@ -39,11 +37,7 @@ class Euler:
 
 
 class UniPC:
-    """UniPC (Zhao et al. 2023) of order 2, variant B2, on predictions of x_0.
-
-    Each call of the network first corrects the sample it was called with, then predicts the next
-    one. The last step is of first order and returns the last prediction.
-    """
+    """UniPC (Zhao et al. 2023) of order 2 (in the end 1), variant B2, on predictions of x_0."""
 
     def __init__(self) -> None:
         self._start: Tensor | None = None
@@ -136,11 +130,9 @@ def sample(
     sampler: Sampler = "euler",
     stop_after: int | None = None,
 ) -> tuple[Latents, Latents]:
-    """Integrate from noise to data, for both streams at once.
+    """Integrate from noise to data, at least one step, for both streams at once.
 
-    `denoise` maps noisy video, noisy touch and times [batch] to predictions of the clean ones. With
-    one network call the sample is the first prediction. After `stop_after` of `num_steps` calls the
-    latents are noisy ones on the way.
+    `denoise` predicts clean latents. After `stop_after` of `num_steps` calls they are still noisy.
 
     Raises:
         InvalidInputError: less than one step.
@@ -162,9 +154,7 @@ def sample(
 class CleanTokens:
     """Clean tokens of each stream after the last layer, and the keys and values of each layer.
 
-    Clean tokens (first latent frame and first touch) attend to each other only and have flow time
-    0, so that in every layer their keys and values are the same at every step of the sampler. Noisy
-    tokens attend to these and to each other, which needs no mask.
+    They attend to each other only and have flow time 0: the same at every step of the sampler.
     """
 
     streams: tuple[Tokens, ...]

@@ -1,13 +1,9 @@
-"""Input tensors of the joint model: image, touch, actions, instruction and geometry of a request.
-
-The training loader and the world server both call `build_inputs`, the only way to build these
-tensors, so that training and serving treat a window identically.
-"""
+"""Input tensors of the joint model, which training and serving build alike: `build_inputs`."""
 
 import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -16,8 +12,8 @@ from torch import Tensor
 
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError, UnknownNameError
 from dextouch.geometry import apply, invert, project, rigid_error, transform_from_pose
-from dextouch.hands.actions import CAMERA_HEAD as CAMERA
 from dextouch.hands.actions import (
+    ACTION_DIM,
     IDENTITY_POSE_9D,
     JOINTS_LEFT,
     JOINTS_RIGHT,
@@ -29,6 +25,7 @@ from dextouch.hands.actions import (
     pose_from_9d,
     pose_to_9d,
 )
+from dextouch.hands.actions import CAMERA_HEAD as CAMERA
 from dextouch.hands.robot_hand import chain_points_of_both_m
 from dextouch.schemas import MAX_OBJECTS, ActionKind
 from dextouch.tactile.layout import TactileLayout
@@ -45,9 +42,8 @@ from services.world_model.network.attention import (
     hand_features,
     mirror_pose_9d,
 )
-from services.world_model.network.configuration import FRAMES_PER_LATENT, NetworkConfig
+from services.world_model.network.configuration import FRAMES_PER_LATENT, NetworkConfig, PastChoice
 from services.world_model.network.instruction import NO_WORD, instruction_ids
-from services.world_model.network.past import PastImages
 
 _PER_SLOT = SLOT_SIZE // len(SAMPLE_OFFSETS) + 6 + 1
 # Of a hand: every slot's features, its box and whether it holds an object; and the side.
@@ -62,15 +58,89 @@ MAX_PRESSURE_KPA = 1e5
 # pose was re-anchored.
 DECIMALS = 9
 ACTION_KINDS: tuple[ActionKind, ActionKind] = ("measured", "commanded")
+# Images that a rollout keeps, the oldest dropped: 34 s at the usual stride.
+MAX_KEPT: Final = 32
+# Two poses are as far apart as their origins and points on their axes: at the length of a hand,
+# and for the camera about where it looks, so that a turn counts by what it changes in the image.
+_HAND_M, _HEAD_M = 0.1, 0.5
+
+
+@dataclass(frozen=True)
+class PastRule:
+    """Which images before a window are chosen: `count` of the last `kept`, `stride` steps apart."""
+
+    count: int
+    choice: PastChoice
+    stride: int
+    kept: int = MAX_KEPT
+
+    @classmethod
+    def of(cls, config: NetworkConfig) -> "PastRule | None":
+        """The rule of a network; None for one that remembers nothing."""
+        if not config.past_images:
+            return None
+        return cls(config.past_images, config.past_choice, config.past_stride)
+
+    def steps(self, start: int) -> Int64[np.ndarray, " kept"]:
+        """Steps of an episode that a rollout would keep before `start`, the oldest first."""
+        every = np.arange(start % self.stride, start, self.stride)
+        return every[max(0, len(every) - self.kept) :]
+
+    def chosen(
+        self, kept: Float64[np.ndarray, "kept 67"], actions: Float64[np.ndarray, "time 67"]
+    ) -> list[int]:
+        """Indices of the chosen of the `kept` images, the oldest first, for a window's actions.
+
+        With `nearest`, latent steps of the window take turns, the last one first, and each takes
+        the image whose poses of hands and camera are nearest to its own. Both have one anchor.
+        """
+        if self.choice == "recent" or len(kept) <= self.count:
+            return list(range(len(kept)))[-self.count :]
+        ends = pose_points_m(actions[FRAMES_PER_LATENT::FRAMES_PER_LATENT])[::-1]
+        away_m = np.linalg.norm(pose_points_m(kept)[None] - ends[:, None], axis=-1).mean(axis=-1)
+        found: list[int] = []
+        for turn in range(self.count):
+            row = away_m[turn % len(ends)].copy()
+            row[found] = np.inf
+            # Of equally near ones the newest.
+            found.append(len(row) - 1 - int(row[::-1].argmin()))
+        return sorted(found)
+
+
+def pose_points_m(actions: Float64[np.ndarray, "n 67"]) -> Float64[np.ndarray, "n 12 3"]:
+    """Origin of wrists and head camera and points on their axes, relative to their anchors."""
+    points = []
+    for part in POSE_SLICES:
+        T = pose_from_9d(actions[:, part])
+        reach_m = _HAND_M if part in (WRIST_LEFT, WRIST_RIGHT) else _HEAD_M
+        axes = np.swapaxes(T[:, :3, :3], 1, 2) * reach_m
+        points.append(T[:, None, :3, 3] + np.concatenate([np.zeros_like(axes[:, :1]), axes], 1))
+    return np.concatenate(points, axis=1)
+
+
+def kept_bytes(config: NetworkConfig) -> int:
+    """Most that a rollout keeps of the past: half-precision latents, and poses and step."""
+    latents = config.tokens_per_frame * config.video_channels * 2
+    return MAX_KEPT * (latents + 8 * (ACTION_DIM + 1)) if config.past_images else 0
+
+
+@dataclass(frozen=True)
+class PastImages:
+    """Images before a window, the oldest first, as pixels or as their latents.
+
+    `actions` [n, 67] are relative to the window's anchor, `ages` how many steps ago they were.
+    `images` have the views of the network, black where one is missing; `latents` are the codec's.
+    """
+
+    actions: Float64[np.ndarray, "n 67"]
+    ages: Int64[np.ndarray, " n"]
+    images: UInt8[np.ndarray, "n views h w 3"] | None = None
+    latents: Float32[np.ndarray, "n tokens channels"] | None = None
 
 
 @dataclass(frozen=True)
 class ObjectsAtStart:
-    """Objects at the first step of a window.
-
-    `poses` are x y z (m), qw qx qy qz in the world; `boxes_m` the middle and the half sizes of each
-    object's box in its frame.
-    """
+    """Objects at a window's first step: x y z (m), qw qx qy qz; boxes as middle and half sizes."""
 
     poses: Float64[np.ndarray, "objects 7"]
     boxes_m: Float64[np.ndarray, "objects 6"]
@@ -87,11 +157,7 @@ class ObjectsAtStart:
 def contact_geometry(
     actions: Float64[np.ndarray, "time 67"], anchor: AnchorPoses, objects: ObjectsAtStart | None
 ) -> Float32[np.ndarray, "time 2 size"]:
-    """Features [time, hand, `GEOMETRY_SIZE`] of every step; zero in slots without an object.
-
-    They are those of the state model's core, for objects as they lie at a window's first step:
-    millimetres decide contact, which neither pixels of a centimetre nor actions show.
-    """
+    """Features of every step as of the state model's core, for objects as they first lie."""
     points_m = torch.from_numpy(hand_motion(actions, anchor).points_m)[:, None]
     steps = len(points_m)
     slots = torch.zeros(steps, 2, MAX_OBJECTS, _PER_SLOT)
@@ -127,20 +193,11 @@ def blots(
 def pose_raster(
     actions: np.ndarray, anchors: np.ndarray, K_head: np.ndarray, *, image_px: int, cells: int
 ) -> Float32[np.ndarray, "batch time 2 cells cells"]:
-    """Rasters of both hands at the poses of the actions, seen by the moving head camera.
+    """Rasters of both hands, left first, at the poses of the actions, as the head camera sees them.
 
-    The paper conditions by AdaLN alone; this is an addition. It shows the network, to within about
-    one cell, where in the image the hands will be.
-
-    Args:
-        actions: [B, T, 67] relative to the anchors.
-        anchors: [B, 3, 4, 4] T_world of left wrist, right wrist and head camera at step 0.
-        K_head: [B, 3, 3] in pixels of the image; lens distortion is not applied.
-        image_px: side of the square image.
-        cells: side of the raster.
-
-    Returns:
-        Left hand, then right hand; points behind the camera leave no blot.
+    The paper conditions by AdaLN alone; this is an addition. `anchors` are T_world of left wrist,
+    right wrist and head camera at step 0; lens distortion is not applied, and points behind the
+    camera leave no blot.
     """
     actions = np.asarray(actions, dtype=np.float64)
     Ts_world_camera = anchors[:, None, 2] @ pose_from_9d(actions[..., CAMERA])
@@ -163,12 +220,11 @@ def pose_raster(
 
 @dataclass(frozen=True)
 class PredictionRequest:
-    """One window to predict.
+    """One window to predict, of T = 1 + 4k actions.
 
-    `actions` [T, 67], T = 1 + 4k, are relative to `anchor`, the poses of row 0; the poses in row 0
-    are the anchor by definition and are ignored. `objects` are those of row 0, where they are
-    known. `further_images` are those of the network's further views, None where one is missing;
-    `past` are the images that it remembers, which only one with `past_images` takes.
+    They are relative to `anchor`, which is row 0 by definition: its poses are ignored. `objects`
+    are those of row 0, `further_images` those of the network's further views, None where one is
+    missing; `past` is for networks with `past_images`.
     """
 
     first_image: UInt8[np.ndarray, "h w 3"]
@@ -227,16 +283,14 @@ class ModelInputs:
     def first_step_keys(self) -> list[bytes]:
         """A digest of all of each window that is known at its first step, without later actions."""
         known = (self.first_image, self.first_tactile_kpa, self.layout, self.raster[:, 0])
-        further = (self.further_images, self.missing, *self._of_past())
+        past = [one for name, one in vars(self).items() if name.startswith("past_")]
+        further = (self.further_images, self.missing, *past)
         arrays = [one.cpu().numpy() for one in (*known, self.commanded, self.words, *further)]
         digests = []
         for index, text in enumerate(self.instructions):
             parts = [text.encode(), *(array[index].tobytes() for array in arrays)]
             digests.append(hashlib.sha256(b"".join(parts)).digest())
         return digests
-
-    def _of_past(self) -> tuple[Tensor, ...]:
-        return tuple(one for name, one in vars(self).items() if name.startswith("past_"))
 
     def rows(self, indices: Sequence[int]) -> "ModelInputs":
         """Some of the windows."""
@@ -420,11 +474,7 @@ def _checked_actions(request: PredictionRequest, config: NetworkConfig) -> np.nd
 
 
 def check_reach(actions: Float64[np.ndarray, "time 67"]) -> None:
-    """Reject poses and angles out of physical range.
-
-    Raises:
-        InvalidInputError: more than 2 m from the anchor, or more than a full turn of a joint.
-    """
+    """Raise InvalidInputError beyond 2 m from the anchor, or a full turn of a joint."""
     for part in POSE_SLICES:
         reach_m = float(np.abs(actions[:, part][:, :3]).max())
         if reach_m > MAX_TRANSLATION_M:

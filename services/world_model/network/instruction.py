@@ -1,17 +1,15 @@
 """Text instructions as inputs of the network: words in a hashed table, or features of UMT5.
 
-Words, or their parts, are hashed, so that any text is accepted without a vocabulary. Entries start
-at zero: words that were not trained on have no effect. At full size, the features of a text encoder
-are computed once for each instruction, and kept in memory, in the checkpoint and, if a folder is
-given, on disk, so that serving known instructions needs no text encoder.
+Entries of the table start at zero: words that were not trained on have no effect. Features are kept
+in memory, in the checkpoint and maybe on disk, so that known ones need no text encoder.
 """
 
 import hashlib
 import html
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Generic, TypeVar
 
 import torch
 from jaxtyping import Float, Float32, Int64
@@ -30,6 +28,7 @@ TOKENIZER_FOLDER: Final = "tokenizer"
 _KEY: Final = "features"
 # Texts kept in memory; the oldest makes room.
 _MAX_TEXTS: Final = 1024
+Value = TypeVar("Value")
 
 
 def instruction_ids(instruction: str, config: NetworkConfig) -> Int64[Tensor, " ids"]:
@@ -60,11 +59,7 @@ class InstructionEncoder(nn.Module):
 
 
 class SubwordEncoder(nn.Module):
-    """Attention pooling of subword embeddings, then two layers.
-
-    The weights of the pooling let the few words that tell instructions apart count more than the
-    many that they share. An empty instruction gives the value of no words.
-    """
+    """Attention pooling of subword embeddings, of which some count more, then two layers."""
 
     def __init__(self, *, word_width: int, width: int) -> None:
         super().__init__()
@@ -86,11 +81,7 @@ class SubwordEncoder(nn.Module):
 
 
 class TextEncoder:
-    """UMT5 encoder and its tokenizer from a local folder in diffusers' layout.
-
-    Raises:
-        NotFoundError: the folder lacks one of the two.
-    """
+    """UMT5 encoder and tokenizer in a folder in diffusers' layout; NotFoundError if one lacks."""
 
     def __init__(self, folder: Path, config: WanConfig) -> None:
         from transformers import AutoTokenizer, UMT5EncoderModel
@@ -132,18 +123,11 @@ class TextFeatures:
         self._known: dict[str, Tensor] = {}
 
     def use(self, folder: Path | None, cache: Path | None = None) -> None:
-        """Choose the folder of the pretrained model, whose text encoder unknown texts are given to.
-
-        Features are kept as safetensors in the folder `cache`; without one, in memory only.
-        """
+        """Choose the folders of the pretrained text encoder and of a cache (safetensors)."""
         self._folder, self._cache, self._encoder = folder, cache, None
 
     def stack(self, texts: Sequence[str]) -> Float[Tensor, "batch words width"]:
-        """Features of several texts, padded with zeros to `text_tokens`, as Wan2.2 expects.
-
-        Raises:
-            InvalidInputError: an unknown text and no encoder.
-        """
+        """Features of several texts, padded with zeros to `text_tokens`; raises as `of`."""
         padded = torch.zeros(
             len(texts), self._config.text_tokens, self._config.text_width, dtype=self._config.dtype
         )
@@ -176,11 +160,7 @@ class TextFeatures:
         return self._known
 
     def learn(self, known: Mapping[str, Tensor]) -> None:
-        """Add features, such as those of a checkpoint.
-
-        Raises:
-            CorruptDataError: features of another width.
-        """
+        """Add features; raises CorruptDataError for those of another width."""
         for key, features in known.items():
             self._known[key] = self._checked(features, f"text features {key}")
 
@@ -224,3 +204,22 @@ def cleaned(text: str) -> str:
 def key_of(text: str) -> str:
     """Key of a text's features: SHA-256 of the cleaned text."""
     return hashlib.sha256(cleaned(text).encode()).hexdigest()
+
+
+class LastUsed(Generic[Value]):
+    """At most `size` values by key; not for several threads."""
+
+    def __init__(self, size: int) -> None:
+        self._size = size
+        self._values: dict[Hashable, Value] = {}
+
+    def of(
+        self, keys: Sequence[Hashable], compute: Callable[[list[int]], Sequence[Value]]
+    ) -> list[Value]:
+        """Values of the keys; `compute` is given the first index of each key that is not kept."""
+        missing = {key: keys.index(key) for key in dict.fromkeys(keys) if key not in self._values}
+        made = compute(list(missing.values())) if missing else []
+        values = {**self._values, **dict(zip(missing, made, strict=True))}
+        used = {key: values.pop(key) for key in dict.fromkeys(keys)}
+        self._values = dict([*values.items(), *used.items()][-self._size :])
+        return [used[key] for key in keys]

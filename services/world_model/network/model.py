@@ -37,9 +37,7 @@ from services.world_model.network.configuration import (
 )
 from services.world_model.network.flow_matching import CleanTokens
 from services.world_model.network.inputs import ModelInputs
-from services.world_model.network.instruction import TextFeatures
-from services.world_model.network.kept import LastUsed
-from services.world_model.network.low_rank import add_adapters, merge_adapters
+from services.world_model.network.instruction import LastUsed, TextFeatures
 from services.world_model.network.tactile import TactileExpert, build_tokenizer
 from services.world_model.network.video import (
     VideoExpert,
@@ -47,7 +45,9 @@ from services.world_model.network.video import (
     WanBlock,
     WanVideoCondition,
     WanVideoExpert,
+    add_adapters,
     empty_transformer,
+    merge_adapters,
 )
 
 _EXACT_PARTS = (
@@ -74,11 +74,9 @@ class FirstLatents:
 
 @dataclass(frozen=True)
 class Context:
-    """What the predictions of a chunk at all flow times have in common.
+    """What the predictions of a chunk at all flow times share; conditions without the time.
 
-    `video` (of the type of the video side) and `tactile` are the conditions without the time.
-    `past` are latents of past images, before those of the window. With `clean`, clean tokens are
-    not computed again for every time.
+    `past` are latents of past images. With `clean`, clean tokens are not computed again.
     """
 
     first: FirstLatents
@@ -119,10 +117,7 @@ class Observed:
 
 @dataclass(frozen=True)
 class Prediction:
-    """Future after the first step; images of all its steps, or of the last ones only.
-
-    `further` has the images of the further views, and `first` the latents of the first images.
-    """
+    """Future after the first step, also of further views; `first` are latents of first images."""
 
     images: Float32[Tensor, "batch shown px px 3"]
     tactile_kpa: Float32[Tensor, "batch steps 2 taxels"]
@@ -144,12 +139,7 @@ class JointWorldModel(nn.Module):
         wan = config.wan
         transformer: Any = None
         if wan is not None:
-            transformer = empty_transformer(
-                wan,
-                num_layers=config.num_layers,
-                num_heads=config.num_heads,
-                head_width=config.head_width,
-            )
+            transformer = empty_transformer(config, wan)
         self.codec: VisualCodec | WanVideoCodec = (
             VisualCodec(config) if wan is None else WanVideoCodec(wan)
         )
@@ -190,10 +180,10 @@ class JointWorldModel(nn.Module):
         self._observed: LastUsed[Observed] | None = None
 
     def keep_contexts(self, count: int) -> None:
-        """Keep what depends on the instruction and on the first step alone for later chunks.
+        """Keep up to `count` results of instruction and first step alone for later chunks.
 
-        At most `count` of each; weights must not change from now on. Clean tokens see the actions
-        of a chunk by the scene encoder, with which only texts are kept.
+        Weights must not change from now on. With the scene encoder, which sees actions, only texts
+        are kept.
         """
         if not self.config.use_scene_encoder:
             self._observed = LastUsed(count)
@@ -253,21 +243,11 @@ class JointWorldModel(nn.Module):
         tactile_kpa: Float32[Tensor, "batch time 2 taxels"],
         further: UInt8[Tensor, "batch further time px px 3"] | None = None,
     ) -> JointLatents:
-        """Clean latents of recorded windows, which the flow ends at, in units of their deviation.
-
-        Residuals from the first latents, or the latents themselves, as the configuration says.
-        `further` are the images of the further views, if there are any.
-        """
+        """Clean latents of recorded windows, or residuals, in units of their deviation."""
         shown = images[:, None] if further is None else torch.cat([images[:, None], further], dim=1)
         video = from_first(self._encoded(shown), self.config.video_target)
-        return JointLatents(video / self.video_residual_std, self.tactile_targets(tactile_kpa))
-
-    def tactile_targets(
-        self, tactile_kpa: Float32[Tensor, "batch time 2 taxels"]
-    ) -> Float32[Tensor, "batch time 2 tactile_tokens tactile_channels"]:
-        """Clean tactile latents; as `targets`."""
-        tactile = from_first(self.tokenizer.encode(tactile_kpa), self.config.tactile_target)
-        return tactile / self.tactile_residual_std
+        touch = from_first(self.tokenizer.encode(tactile_kpa), self.config.tactile_target)
+        return JointLatents(video / self.video_residual_std, touch / self.tactile_residual_std)
 
     def forward(
         self,
@@ -276,10 +256,7 @@ class JointWorldModel(nn.Module):
         noisy: JointLatents,
         t: Float32[Tensor, " batch"],
     ) -> JointLatents:
-        """Predict clean latents, or velocities, from noisy ones at time t (the first are clean).
-
-        Without touch the tactile latents are returned as they came.
-        """
+        """Predict clean latents, or velocities, from noisy ones at time t (first ones clean)."""
         return self.denoise(self.context(inputs, first), noisy, t)
 
     def context(self, inputs: ModelInputs, first: FirstLatents) -> Context:
@@ -369,10 +346,7 @@ class JointWorldModel(nn.Module):
         )
 
     def attention_mask(self, num_steps: int) -> Bool[Tensor, "tokens tokens"]:
-        """Mask by which clean tokens attend to each other only.
-
-        They are those of past images, of the first latent frame, and of the first touch.
-        """
+        """Mask by which past and first images and first touch attend to each other only."""
         per_frame, num_clean = self.config.tokens_per_frame, self.config.num_clean_frames
         num_frames = num_clean - 1 + num_latents(num_steps)
         is_clean = torch.arange(num_frames * per_frame) < num_clean * per_frame
@@ -400,48 +374,37 @@ class JointWorldModel(nn.Module):
         *,
         sampling: Sampling | None = None,
         all_images: bool = True,
-        precision: Precision = "float32",
     ) -> Prediction:
-        """Sample a future for every request.
-
-        There is one `noise` per request; like the inputs it may be on any device. Of the images,
-        all are decoded or only the last ones. `precision` is that of the experts' matrix
-        products (autocast); codecs always use float32.
-        """
+        """Sample a future for every request, with its `noise`; of the images all, or the last."""
         inputs, sampling = self.with_past(inputs.to(self.device)), sampling or Sampling()
         noise, num_windows = mapped(noise, lambda one: one.to(self.device)), len(inputs)
         conditions = inputs
         if sampling.guidance != 1.0:
             everything = torch.ones(num_windows, dtype=torch.bool, device=self.device)
             conditions = inputs.joined(inputs.without(everything, everything))
-        first, kept = self._observe(conditions, noise, sampling, precision)
-        clean = self.sample(conditions, first, noise, sampling, precision=precision, kept=kept)
+        first, kept = self._observe(conditions, noise, sampling)
+        clean = self.sample(conditions, first, noise, sampling, kept=kept)
         first = mapped(first, lambda one: one[:num_windows])
         future = self.decode(first, clean, all_images=all_images)
         touch = self.tokenizer.bounded(future.tactile_kpa, inputs.first_tactile_kpa)
         return replace(future, tactile_kpa=touch)
 
     def _observe(
-        self, inputs: ModelInputs, noise: JointLatents, sampling: Sampling, precision: Precision
+        self, inputs: ModelInputs, noise: JointLatents, sampling: Sampling
     ) -> tuple[FirstLatents, CleanTokens | None]:
         """First latents, and clean tokens where those of earlier chunks are kept."""
         if self._observed is None or not sampling.keep_context:
             return self.first_latents(inputs), None
 
         def compute(rows: list[int]) -> list[Observed]:
-            some, noisy = (
-                inputs.rows(rows),
-                mapped(noise, lambda one: one[:1].expand(len(rows), *one.shape[1:])),
-            )
+            some = inputs.rows(rows)
+            noisy = mapped(noise, lambda one: one[:1].expand(len(rows), *one.shape[1:]))
             first = self.first_latents(some)
-            with products_in(precision, self.device.type):
-                clean = self.clean_tokens(self.context(some, first), noisy)
-            whole = Observed(first, clean)
+            whole = Observed(first, self.clean_tokens(self.context(some, first), noisy))
             each = torch.split(torch.arange(len(rows), device=self.device), 1)
             return [mapped(whole, partial(torch.index_select, dim=0, index=row)) for row in each]
 
-        keys = [(precision, key) for key in inputs.first_step_keys()]
-        found = combined(self._observed.of(keys, compute), torch.cat)
+        found = combined(self._observed.of(inputs.first_step_keys(), compute), torch.cat)
         return found.first, found.clean
 
     @torch.no_grad()
@@ -452,7 +415,6 @@ class JointWorldModel(nn.Module):
         noise: JointLatents,
         sampling: Sampling,
         *,
-        precision: Precision = "float32",
         kept: CleanTokens | None = None,
     ) -> JointLatents:
         """Sample clean latents.
@@ -460,7 +422,7 @@ class JointWorldModel(nn.Module):
         With guidance, `inputs` and `first` are those of all windows, followed by the same without
         their instructions and actions. `kept` are clean tokens that are known already.
         """
-        device, is_guided = self.device, sampling.guidance != 1.0
+        is_guided = sampling.guidance != 1.0
         num_steps = sampling.num_steps or self.config.sampling_steps
 
         def all_of(latents: Tensor) -> Tensor:
@@ -468,20 +430,18 @@ class JointWorldModel(nn.Module):
 
         context: Context | None = None
         if sampling.keep_context and (num_steps > 1 or kept is not None):
-            with products_in(precision, device.type):
-                context = self.context(inputs, first)
-                kept = kept or self.clean_tokens(context, mapped(noise, all_of))
-                context = replace(context, clean=kept)
+            context = self.context(inputs, first)
+            kept = kept or self.clean_tokens(context, mapped(noise, all_of))
+            context = replace(context, clean=kept)
 
         def denoise(video: Tensor, tactile: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
-            with products_in(precision, device.type):
-                noisy, times = JointLatents(all_of(video), all_of(tactile)), all_of(t)
-                # Weights that are sharded over processes are there in `forward` only.
-                guess = (
-                    self(inputs, first, noisy, times)
-                    if context is None
-                    else self.denoise(context, noisy, times)
-                )
+            noisy, times = JointLatents(all_of(video), all_of(tactile)), all_of(t)
+            # Weights that are sharded over processes are there in `forward` only.
+            guess = (
+                self(inputs, first, noisy, times)
+                if context is None
+                else self.denoise(context, noisy, times)
+            )
             found = guess.video.float(), guess.tactile.float()
             if is_guided:
                 (conditioned, unconditional), touch = (one.chunk(2) for one in found)
@@ -510,10 +470,7 @@ class JointWorldModel(nn.Module):
     def decode(
         self, first: FirstLatents, clean: JointLatents, *, all_images: bool = True
     ) -> Prediction:
-        """Images and pressures after the first step; of the images maybe the last ones only.
-
-        Without touch all pressures are zero.
-        """
+        """Images, maybe the last only, and pressures after the first step (0 without touch)."""
         clean = self.with_clean_first(clean, first)
         video = self.video_residual_std * clean.video
         if self.config.video_target == "residual":

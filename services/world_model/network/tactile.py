@@ -117,11 +117,11 @@ class LearnedTokenizer(TactileTokenizer):
 class MapShape:
     """Shape of the maps that one convolutional autoencoder handles, and its size.
 
-    Layers have no biases and embeddings multiply features instead of being added, so that an
-    untouched map is the zero latent and the zero latent an untouched map, whatever the weights are.
-    The `num_maps` maps of a hand share the weights and differ by an identity embedding. `channels`
-    are latent values of each map, `width` is that of the convolutions, and `hidden` that of the
-    layer between features and latents. The encoder halves the resolution `num_halvings` times.
+    Layers have no biases and embeddings multiply features, so that an untouched map is the zero
+    latent and the reverse. The `num_maps` maps of a hand differ by an identity embedding.
+    `channels` are latent values of each map, `width` is that of the convolutions, and `hidden` that
+    of the layer between features and latents. The encoder halves the resolution `num_halvings`
+    times.
     """
 
     rows: int
@@ -209,10 +209,8 @@ def _convolution(in_width: int, out_width: int, *, stride: int = 1) -> nn.Conv2d
 def canvas_cells(layout: TactileLayout) -> tuple[np.ndarray, tuple[int, int]]:
     """Cell of the canvas, counted row by row, of each taxel, and the canvas' rows and columns.
 
-    The fingers are side by side in the top rows, thumb to little finger, and the palm is below,
-    in the middle. Of `dextouch_v1` the fingertips fill columns 0 to 19 of rows 0 to 3, the palm
-    columns 2 to 17 of rows 4 to 18, and 80 of the 400 cells are empty. Inside every pad rows run
-    from distal to proximal and columns from radial to ulnar.
+    Fingers are side by side in the top rows, thumb to little finger, the palm below, in the middle.
+    Inside every pad rows run from distal to proximal and columns from radial to ulnar.
     """
     fingers, palm = layout.fingers, layout.palm
     palm_shape = (0, 0) if palm is None else palm.shape
@@ -234,10 +232,7 @@ def canvas_cells(layout: TactileLayout) -> tuple[np.ndarray, tuple[int, int]]:
 
 
 class GridTokenizer(LearnedTokenizer):
-    """One autoencoder for palm and fingertips on one canvas, the paper's baseline.
-
-    It has as many weights as Split-Hands; taxels far apart on the hand are neighbours on it.
-    """
+    """One autoencoder for palm and fingertips on one canvas, the paper's baseline of equal size."""
 
     _cells: Tensor
 
@@ -267,8 +262,7 @@ class GridTokenizer(LearnedTokenizer):
 class SplitHandsTokenizer(LearnedTokenizer):
     """One autoencoder for fingertips, one for palms, as in the paper.
 
-    An identity embedding tells the pads apart, and an embedding of the position the taxels of a
-    pad. A hand is one token per pad (`tactile_tokens` "pad", as in the paper) or all of them in one
+    A hand is one token per pad (`tactile_tokens` "pad", as in the paper) or all of them in one
     token ("hand", several times cheaper in the world model); the weights are the same.
     """
 
@@ -362,11 +356,7 @@ class PrincipalAxesTokenizer(TactileTokenizer):
 
 
 def build_tokenizer(config: NetworkConfig) -> TactileTokenizer:
-    """The tokenizer that the configuration names, with initial weights.
-
-    Raises:
-        InvalidInputError: tokens per pad with another tokenizer than Split-Hands.
-    """
+    """The tokenizer of a configuration; raises InvalidInputError for pads that it does not have."""
     if config.tactile_tokens == "pad" and config.tokenizer != "split_hands":
         raise InvalidInputError(
             f"network: got tactile_tokens pad with tokenizer {config.tokenizer}, expected hand; "
@@ -406,10 +396,7 @@ class TactileExpert(nn.Module):
         first: Float32[Tensor, "batch 2 tokens channels"],
         condition: Condition,
     ) -> Stream:
-        """Tokens before the first layer.
-
-        `noisy` are residuals, the first ones zero, or plain latents, the first ones clean.
-        """
+        """Tokens of residuals (the first zero) or of plain latents (the first clean)."""
         steps, dtype = self.steps[: noisy.shape[1]], self.steps.dtype
         condition = condition.to(dtype)
         if self._is_anchored:

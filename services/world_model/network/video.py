@@ -1,7 +1,7 @@
 """The video expert of the joint model, and its conditions: a small one or Wan2.2's."""
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import torch
 from jaxtyping import Bool, Float, Float32
@@ -19,6 +19,7 @@ from services.world_model.network.attention import (
     modulated_norm,
     rotate,
     split_axis,
+    two_layers,
     video_positions,
     zero_linear,
 )
@@ -30,7 +31,6 @@ from services.world_model.network.conditioning import (
     Condition,
     PastCondition,
     after_first,
-    two_layers,
     without_dropped,
 )
 from services.world_model.network.configuration import (
@@ -39,14 +39,15 @@ from services.world_model.network.configuration import (
     RASTER_CELLS_PER_TOKEN,
     NetworkConfig,
     WanConfig,
+    num_latents,
 )
 from services.world_model.network.inputs import ModelInputs
-from services.world_model.network.instruction import TextFeatures
-from services.world_model.network.kept import LastUsed
+from services.world_model.network.instruction import LastUsed, TextFeatures
 
 if TYPE_CHECKING:
     from diffusers import WanTransformer3DModel
 
+_ADAPTERS: Final = (".lora_down", ".lora_up")
 _Raster = Float32[Tensor, "batch time 2 cells cells"]
 _PastRaster = Float32[Tensor, "batch past 2 cells cells"]
 
@@ -66,7 +67,7 @@ class VideoExpert(nn.Module):
         self.embed = nn.Linear((1 + self.is_anchored) * config.video_channels, width)
         self.embed_raster = nn.Linear(raster_width, width, bias=False)
         self.places = nn.Parameter(0.02 * torch.randn(config.tokens_per_latent, width))
-        self.frames = nn.Parameter(0.02 * torch.randn(config.max_latents, 1, width))
+        self.frames = nn.Parameter(0.02 * torch.randn(num_latents(config.max_steps), 1, width))
         self.modulate = nn.Sequential(nn.SiLU(), zero_linear(width, NUM_MODULATIONS * width))
         self.modulate_out = nn.Sequential(nn.SiLU(), zero_linear(width, 2 * width))
         self.predict = zero_linear(width, config.video_channels)
@@ -79,11 +80,7 @@ class VideoExpert(nn.Module):
         raster: _Raster,
         past_raster: _PastRaster,
     ) -> Stream:
-        """Tokens before the first layer.
-
-        `noisy` are residuals, the first one zero, or plain latents, the first one clean; those of
-        past images come before it. Rasters are of the head's view.
-        """
+        """Tokens before the first layer; latents of past images come first, then a clean one."""
         dtype, num_past = self.places.dtype, past_raster.shape[1]
         condition = condition.to(dtype)
         if self.is_anchored:
@@ -120,10 +117,7 @@ class VideoExpert(nn.Module):
 
 
 class ViewTokens(nn.Module):
-    """What tells apart the tokens of the head's view, of further ones, and of past images.
-
-    Tokens of a missing view are all equal, so that nothing comes from them.
-    """
+    """Embeddings of further views, past images, and missing views, whose tokens are all equal."""
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
@@ -166,9 +160,9 @@ class WanConstants:
 class WanVideoCondition(nn.Module):
     """Times, actions and instructions as the transformer of Wan2.2 takes them.
 
-    Modulations are computed per latent frame, each with its own time, 0 for the clean first one.
-    Actions are added to the embedding of the time, with an effect of zero before training. Without
-    them and tactile tokens, the video side equals diffusers' `WanTransformer3DModel`.
+    Actions are added to the embedding of the time of each latent frame, with an effect of zero
+    before training. Without them and touch, the video side equals diffusers'
+    `WanTransformer3DModel`.
     """
 
     def __init__(self, config: NetworkConfig, wan: WanConfig, embedder: nn.Module) -> None:
@@ -336,18 +330,67 @@ class WanVideoExpert(nn.Module):
         return predicted
 
 
-def empty_transformer(
-    config: WanConfig, *, num_layers: int, num_heads: int, head_width: int
-) -> "WanTransformer3DModel":
+def empty_transformer(config: NetworkConfig, wan: WanConfig) -> "WanTransformer3DModel":
     """Transformer on the meta device, in the precision of the configuration."""
     from diffusers import WanTransformer3DModel
 
-    sizes = config.transformer_sizes(
-        num_layers=num_layers, num_heads=num_heads, head_width=head_width
+    sizes = wan.transformer_sizes(
+        num_layers=config.num_layers, num_heads=config.num_heads, head_width=config.head_width
     )
     with torch.device("meta"):
         transformer = WanTransformer3DModel(**sizes)
     for name, parameter in transformer.named_parameters():
         is_exact = any(part in name for part in FLOAT32_PARTS)
-        parameter.data = parameter.data.to(torch.float32 if is_exact else config.dtype)
+        parameter.data = parameter.data.to(torch.float32 if is_exact else wan.dtype)
     return transformer.eval()
+
+
+class AdaptedLinear(nn.Linear):
+    """A linear layer with an adapter (LoRA, Hu et al. 2022); weight and bias keep their names.
+
+    W x + b becomes W x + b + s U D x, with D of `rank` rows and U of `rank` columns that begins at
+    zero. Adapters are float32 beside weights of any precision.
+    """
+
+    def __init__(self, base: nn.Linear, rank: int, scale: float) -> None:
+        super().__init__(base.in_features, base.out_features, device="meta")
+        self.weight, self.bias = base.weight, base.bias
+        self.scale = scale
+        self.lora_down = nn.Parameter(torch.empty(rank, base.in_features))
+        self.lora_up = nn.Parameter(torch.zeros(base.out_features, rank))
+        nn.init.kaiming_uniform_(self.lora_down, a=5**0.5)
+
+    def forward(self, rows: Float[Tensor, "*batch given"]) -> Float[Tensor, "*batch made"]:
+        """The layer's outputs with those of the adapter, in the precision of the former."""
+        made = super().forward(rows)
+        low = functional.linear(rows.to(self.lora_down.dtype), self.lora_down)
+        return made + (self.scale * functional.linear(low, self.lora_up)).to(made.dtype)
+
+    def merged_weight(self) -> Float[Tensor, "made given"]:
+        """The weight of a linear layer with the same outputs, but for its precision."""
+        change = self.scale * (self.lora_up.float() @ self.lora_down.float())
+        return (self.weight.float() + change).to(self.weight.dtype)
+
+
+def add_adapters(network: nn.Module, rank: int, scale: float) -> None:
+    """Give every linear layer of a network an adapter, in place."""
+    for parent in list(network.modules()):
+        for name, child in parent.named_children():
+            if type(child) is nn.Linear:
+                setattr(parent, name, AdaptedLinear(child, rank, scale))
+
+
+def is_adapter(name: str) -> bool:
+    """Whether a tensor of this name belongs to an adapter."""
+    return name.endswith(_ADAPTERS)
+
+
+@torch.no_grad()
+def merge_adapters(network: nn.Module) -> None:
+    """Replace every layer that has an adapter by a linear layer with the same outputs, in place."""
+    for parent in list(network.modules()):
+        for name, child in parent.named_children():
+            if isinstance(child, AdaptedLinear):
+                plain = nn.Linear(child.in_features, child.out_features, device="meta")
+                plain.weight, plain.bias = nn.Parameter(child.merged_weight()), child.bias
+                setattr(parent, name, plain.requires_grad_(child.weight.requires_grad))

@@ -14,11 +14,7 @@ PRESETS: Final = tuple(sorted(path.stem for path in _FOLDER.glob("*.toml")))
 
 
 def preset_settings(name: str) -> dict[str, Any]:
-    """Settings of a preset, over those of the preset that it names as its `base`.
-
-    Raises:
-        UnknownNameError: no such preset.
-    """
+    """Settings of a preset over those of its `base`; raises UnknownNameError if there is none."""
     if name not in PRESETS:
         raise UnknownNameError("preset", name, list(PRESETS))
     own = tomllib.loads((_FOLDER / f"{name}.toml").read_text(encoding="utf-8"))

@@ -1,9 +1,7 @@
 """Network inputs of the renderer: warped start image, drawn hands and drawn objects.
 
-`change` masks where the network may draw: it is zero, and the image therefore exactly the warped
-start image, where no body moved relative to the table and the camera stood still. Pixels of the
-table plane (z = 0 in the world) move by a homography; rays that meet the plane beyond `FAR_M`, or
-never, move as if they came from infinity.
+Pixels of the table plane (z = 0 in the world) move by a homography; rays that meet the plane beyond
+`FAR_M`, or never, move as if they came from infinity.
 """
 
 from dataclasses import dataclass
@@ -16,7 +14,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from dextouch.geometry import apply, invert
-from services.world_model.rendering.configuration import Interpolation, RendererConfig
+from services.world_model.network.configuration import Interpolation, RendererConfig
 from services.world_model.rendering.rasters import (
     MIN_DEPTH_M,
     BoxHits,
@@ -54,12 +52,10 @@ _PER_M, _NEARNESS_M = 10.0, 0.5
 
 @dataclass(frozen=True)
 class CameraMotion:
-    """Maps from pixels of later images to pixels of start images.
+    """Maps from homogeneous pixels of later images to those of start images, near and far.
 
-    `table` maps homogeneous pixels of a later image to those of the start, on the table; `infinity`
-    does the same for points at infinity. The product of the row vectors `inverse_depth` with a
-    homogeneous pixel is 1 / (depth of the table there), in 1/m; they are zero for a camera that
-    sees the table as a line.
+    The product of the row vectors `inverse_depth` with a homogeneous pixel is 1 / (depth of the
+    table there), in 1/m; they are zero for a camera that sees the table as a line.
     """
 
     table: Float64[np.ndarray, "n 3 3"]
@@ -117,10 +113,7 @@ class CameraMotion:
 
 @dataclass(frozen=True)
 class Bodies:
-    """Hands and object boxes in one camera per state.
-
-    `pixels` and `in_front` cover 22 points of each hand, then the eight corners of each box.
-    """
+    """Hands and object boxes in one camera per state: 22 points of each hand, then box corners."""
 
     Ts_camera_box: Float64[np.ndarray, "n k 4 4"]
     hands_world: Float64[np.ndarray, "n 2 22 3"]
@@ -146,10 +139,7 @@ class Bodies:
 
 @dataclass(frozen=True)
 class Scenes:
-    """Start images with their camera, states and object boxes.
-
-    `boxes_m` holds centre and half sizes (x y z, x y z) of each object's box in the object frame.
-    """
+    """Start images with camera, states and boxes (centre, half sizes) in the objects' frames."""
 
     images: UInt8[np.ndarray, "b h w 3"]
     K_head: Float64[np.ndarray, "b 3 3"]
@@ -161,8 +151,7 @@ class Scenes:
 class DrawingInputs:
     """Channels at full and half size, and the mask in which the network may draw.
 
-    The fine channels begin with the colours that are blended: those of the warped start image, of
-    the objects and of the hands.
+    The fine ones begin with the colours of the warped start image, of the objects and of the hands.
     """
 
     fine: Float32[Tensor, "n 15 h w"]
@@ -172,10 +161,7 @@ class DrawingInputs:
 
 @dataclass(frozen=True)
 class _Start:
-    """Start images as planes: colours, coverage by the hands and by objects; and what is where.
-
-    `shown` is 0, or one more than the slot of the object that a pixel shows.
-    """
+    """Start images, their coverage by hands and objects, and 1 + the slot that a pixel shows."""
 
     layers: Float32[np.ndarray, "b 5 h w"]
     hands: Float32[np.ndarray, "b 2 h w"]
@@ -408,10 +394,7 @@ def is_inside(
 def motion_shares(
     before: Bodies, now: Bodies, owner: Int64[np.ndarray, " n"], motion: CameraMotion
 ) -> Float64[np.ndarray, "n bodies"]:
-    """Motion share, from 0 (still) to 1 (moved), of left hand, right hand and each object.
-
-    A body moves when any of its points leaves its position in the warped start image.
-    """
+    """Motion share, from 0 (still) to 1 (moved), of left hand, right hand and each object."""
     shift = np.linalg.norm(motion.to_start(now.pixels) - before.pixels[owner], axis=-1)
     shift = np.where(before.in_front[owner] & now.in_front, shift, 0.0)
     # Points that crossed the camera plane have moved.

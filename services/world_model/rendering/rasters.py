@@ -1,9 +1,6 @@
 """Scene states, and rasters of their objects and hands in an image.
 
-Objects are bounding boxes found by casting rays; the nearest box wins. A hit takes its colour from
-where its object's point was in the start image. Hands are coloured bones, by splatting points of
-the kinematic chains: each bone is a ribbon of points that faces the camera, coloured by the start
-image. A soft depth test resolves occlusion.
+Objects are boxes, by casting rays; hands are ribbons of coloured points along their bones.
 """
 
 from collections.abc import Sequence
@@ -36,14 +33,12 @@ _OPACITY = 1.6
 _PALM_ROWS, _PALM_COLUMNS = 7, 9
 _WRIST, _FOREARM_END = 0, 21
 _KNUCKLES = (5, 9, 13, 17)
+_Mixture = Float64[np.ndarray, "points 22"]
 
 
 @dataclass(frozen=True)
 class SceneStates:
-    """Scenes at several steps; poses are x y z (m), then the quaternion w x y z, in the world.
-
-    Slots of absent objects hold arbitrary finite numbers.
-    """
+    """Scenes at several steps; poses are x y z (m), q_wxyz in the world, finite where absent."""
 
     Ts_world_camera: Float64[np.ndarray, "n 4 4"]
     Ts_world_wrist: Float64[np.ndarray, "n 2 4 4"]
@@ -105,10 +100,9 @@ def joined(parts: Sequence[Arrays]) -> Arrays:
 
 @dataclass(frozen=True)
 class BoxHits:
-    """Pixels that see a box, each with its nearest one.
+    """Pixels that see a box, each with its nearest one; `place` is flat over all images.
 
-    `place` is the flat pixel index over all images, row by row; `local` is the entry point in units
-    of the half sizes, `thickness_m` the difference in depth between entry and exit.
+    `local` is the entry point in half sizes, `thickness_m` the depth from entry to exit.
     """
 
     place: Int64[np.ndarray, " hits"]
@@ -144,10 +138,7 @@ def cast_boxes(
     K: Float64[np.ndarray, "n 3 3"],
     shape_px: tuple[int, int],
 ) -> BoxHits:
-    """Intersect the rays of pixel centres with boxes (slab method of Kay and Kajiya, 1986).
-
-    Only pixels in the bounding rectangle of a box are tested; of one behind the camera, all.
-    """
+    """Intersect rays of pixel centres with boxes (slab method of Kay and Kajiya, 1986)."""
     half_m = np.maximum(half_m, MIN_HALF_M)[present]
     Ts_box_camera = invert(Ts_camera_box[present])
     images, slots = np.nonzero(present)
@@ -206,10 +197,7 @@ def positions_at_start(
     half_m: Float64[np.ndarray, "n k 3"],
     K: Float64[np.ndarray, "n 3 3"],
 ) -> Float64[np.ndarray, "hits 2"]:
-    """Start image pixels of the hit points; far outside for points behind the start camera.
-
-    `Ts_start_box` are the boxes' poses at the start in the start camera, and `K` its intrinsics.
-    """
+    """Start image pixels of the hit points, of boxes in the start camera; far outside behind it."""
     x, y, z = hits.local.T
     scaled = (K[:, None] @ Ts_start_box[..., :3, :]).transpose(2, 3, 0, 1)
     scaled[:, :3] *= np.maximum(half_m, MIN_HALF_M).transpose(2, 0, 1)
@@ -242,15 +230,6 @@ def colours_at_positions(
 
 
 @dataclass(frozen=True)
-class _Ribbons:
-    """Fixed weights of a hand's points over 22 base points, and their offsets across ribbons."""
-
-    mixture: Float64[np.ndarray, "points 22"]
-    direction: Float64[np.ndarray, "points 22"]
-    lateral_m: Float64[np.ndarray, " points"]
-
-
-@dataclass(frozen=True)
 class HandPoints:
     """Points of both hands in an image: pixels, depths, and which are in front of the camera."""
 
@@ -269,7 +248,8 @@ class HandRaster:
 
 
 @cache
-def _ribbons() -> _Ribbons:
+def _ribbons() -> tuple[_Mixture, _Mixture, Float64[np.ndarray, " points"]]:
+    """Weights of a hand's points over 22 base points, and their direction and offset (m)."""
     bones = [(1 + 4 * f + j, 2 + 4 * f + j, _BONE_RADIUS_M, 5) for f in range(5) for j in range(3)]
     bones += [(_WRIST, 1, _BONE_RADIUS_M, 5), (_WRIST, _FOREARM_END, _FOREARM_RADIUS_M, 5)]
     mixture, direction, lateral = [], [], []
@@ -294,7 +274,7 @@ def _ribbons() -> _Ribbons:
             mixture.append(row)
             direction.append(np.zeros(22))
             lateral.append(0.0)
-    return _Ribbons(np.array(mixture), np.array(direction), np.array(lateral))
+    return np.array(mixture), np.array(direction), np.array(lateral)
 
 
 def base_points_world(states: SceneStates) -> Float64[np.ndarray, "n 2 22 3"]:
@@ -312,20 +292,17 @@ def project_hands(
     *,
     middle_only: bool = False,
 ) -> HandPoints:
-    """Project all points of both hands into a camera.
-
-    With `middle_only`, every point is put on the centre line of its bone.
-    """
-    ribbons = _ribbons()
+    """Project all points of both hands into a camera, with `middle_only` all on their bones."""
+    mixture, direction, lateral_m = _ribbons()
     base = apply(invert(T_world_camera)[:, None], base_world)
     # Vectors are [3, n, 2, points]: one block of numbers per axis is much faster to compute with.
     axes = np.ascontiguousarray(np.moveaxis(base, -1, 0))
-    points = axes @ ribbons.mixture.T
+    points = axes @ mixture.T
     if not middle_only:
-        (ax, ay, az), (x, y, z) = axes @ ribbons.direction.T, points
+        (ax, ay, az), (x, y, z) = axes @ direction.T, points
         sideways = np.stack([ay * z - az * y, az * x - ax * z, ax * y - ay * x])
         length = np.sqrt((sideways**2).sum(axis=0))
-        points = points + sideways * (ribbons.lateral_m / np.maximum(length, 1e-9))
+        points = points + sideways * (lateral_m / np.maximum(length, 1e-9))
     depth = points[2]
     pixels = np.einsum("nij,jnsp->nspi", K[:, :2], points)
     pixels /= np.maximum(depth, MIN_DEPTH_M)[..., None]

@@ -13,15 +13,16 @@ from torch.nn import functional
 from dextouch.errors import InvalidInputError
 from dextouch.geometry.rotations import quaternion_from_rotation, rotation_from_vector
 from services.networks.optimizer import Budget, OptimizerLoop, update_average
-from services.world_model.rendering.configuration import RendererConfig, RendererTraining
+from services.world_model.network.configuration import RendererConfig
 from services.world_model.rendering.inputs import (
     DrawingInputs,
     PreparedScenes,
     Scenes,
     drawing_inputs,
 )
-from services.world_model.rendering.network import RendererNetwork, has_fast_bfloat16
 from services.world_model.rendering.rasters import SceneStates, joined, object_transforms
+from services.world_model.rendering.renderer import RendererNetwork, has_fast_bfloat16
+from services.world_model.settings import RendererTraining
 
 LOG_EVERY_STEPS = 50
 _EDGE_WINDOW_PX = 7
@@ -34,10 +35,7 @@ OnProgress = Callable[[float, int, float], None]
 
 @dataclass(frozen=True)
 class SceneClip:
-    """At least two images of one episode at `steps`, with the ground-truth state at each of them.
-
-    `boxes_m` holds centre and half sizes (x y z, x y z) of each object's box in the object frame.
-    """
+    """At least two images of one episode at `steps`, and true states; boxes as of `Scenes`."""
 
     steps: Int64[np.ndarray, " images"]
     images: UInt8[np.ndarray, "images h w 3"]
@@ -60,15 +58,12 @@ def train_renderer(
 ) -> tuple[RendererNetwork, float]:
     """Train on pairs of images of one clip: a start image and a target image.
 
-    `rng` draws initial weights, pairs and pose noise. `on_progress` is called every few steps with
-    the completed share, the step and the loss. Weights begin as those of `initial`, if given.
-
-    Returns:
-        The averaged network, and the CPU seconds of training.
+    `rng` draws initial weights (but those of `initial`), pairs and pose noise. `on_progress` is
+    called with the completed share, the step and the loss. Returns the averaged network and CPU
+    seconds.
 
     Raises:
-        InvalidInputError: no clips, several sizes of images, or sides that the network does not
-            support.
+        InvalidInputError: no clips, several sizes of images, or unsupported sides.
     """
     run = RendererRun(clips, config, settings, rng=rng)
     if initial is not None:
@@ -95,7 +90,7 @@ class RendererRun:
         rng: np.random.Generator,
     ) -> None:
         sizes = {clip.images.shape[1:3] for clip in clips}
-        multiple = config.pixel_multiple
+        multiple = 2 ** len(config.widths)
         if len(sizes) != 1 or any(side % multiple for size in sizes for side in size):
             raise InvalidInputError(
                 f"renderer training: got {len(clips)} clips of image sizes {sorted(sizes)}, "
@@ -155,12 +150,7 @@ class RendererRun:
 def drawing_loss(
     drawn: Float32[Tensor, "n 3 h w"], true: Float32[Tensor, "n 3 h w"], settings: RendererTraining
 ) -> Float32[Tensor, ""]:
-    """Mean absolute error of colours (0 … 1), of image gradients and of edge strength.
-
-    An edge drawn a pixel off costs twice in colours and a missing edge once, so that colours alone
-    lead to blurred images; the mean strength of edges in a window does not depend on where exactly
-    they are.
-    """
+    """Mean absolute error of colours (0 … 1), which alone blur, of gradients and edges."""
     error = drawn - true
     across = (error[..., 1:] - error[..., :-1]).abs().mean()
     down = (error[..., 1:, :] - error[..., :-1, :]).abs().mean()

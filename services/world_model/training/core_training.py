@@ -45,9 +45,8 @@ _MEASURED_SHARE = 0.15
 class CoreData:
     """Training data of cores: episodes, touch latents and a reader's outputs.
 
-    Cores start from true poses with noise of known size. `readings` are a reader's by start step,
-    which episodes start from whose objects are not labelled or not known there, or all if
-    `starts_read`; empty if none does.
+    Cores start from true poses with noise, but from `readings` of their start step where objects
+    are not labelled or not known, or everywhere if `starts_read`.
     """
 
     table: SceneTable
@@ -74,11 +73,7 @@ def train_core(
     on_step: OnStep | None = None,
     initial: RecurrentCore | None = None,
 ) -> RecurrentCore:
-    """Train a core to predict scenes from any start step to the end.
-
-    Weights of `initial` that require gradients are changed. `on_step` is called with each step and
-    its loss.
-    """
+    """Train a core, or what of `initial` requires gradients, on scenes from any start step."""
     generator, rng = torch.Generator().manual_seed(seed), np.random.default_rng(seed)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
@@ -97,10 +92,7 @@ def train_core(
 
 @torch.no_grad()
 def describe(core: RecurrentCore, table: SceneTable, *, widens: bool = False) -> None:
-    """Set a core's objects of every task, and the range of the hands' motion.
-
-    With `widens`, the range that the core already has is kept, and widened.
-    """
+    """Set a core's objects of every task, and the range of hands, or with `widens` widen it."""
     # Tasks without episodes keep what the core knows of them.
     seen = torch.bincount(table.task, minlength=len(core.boxes_m)) > 0
     core.boxes_m[seen] = table.boxes_m[seen]
@@ -117,15 +109,12 @@ def describe(core: RecurrentCore, table: SceneTable, *, widens: bool = False) ->
 def start_steps(table: SceneTable) -> list[int]:
     """Steps with an image from which cores are trained, up to the last possible latent step."""
     last = table.num_steps - 1 - STEPS_PER_LATENT
-    wanted = {*range(0, last, _START_STRIDE), last}
-    return [step for step in table.image_steps if step in wanted]
+    starts = {*range(0, last, _START_STRIDE), last}
+    return [step for step in table.image_steps if step in starts]
 
 
 def _later_start(later: list[int], table: SceneTable, rng: np.random.Generator) -> int:
-    """Random start, with a probability proportional to the root of the remaining length.
-
-    Starts near the end teach little about persistence. Those of few episodes are as much rarer.
-    """
+    """Random start, rarer near the end, which teaches little, and where few episodes have one."""
     remaining = np.sqrt([table.num_steps - 1 - step for step in later])
     weight = remaining * [len(table.starts_at(step)) for step in later]
     return int(rng.choice(later, p=weight / weight.sum()))
@@ -180,7 +169,6 @@ def _read_start(
 ) -> Reading:
     """True objects with noise, or a reader's where they are unknown or it shall be so.
 
-    The noise of each object has its own standard deviation; that of clicks is in the poses already.
     Poses from touch are those of takes that succeeded: where a task has some, all of its episodes
     start from what the reader sees, or starts would tell the outcome.
     """
@@ -189,10 +177,14 @@ def _read_start(
     shift = torch.randn(true.position_m.shape, generator=generator) * sd_m[..., None]
     shift[..., 2] *= 0.3
     turn = torch.randn(true.axes.shape, generator=generator) * sd_m[..., None, None] * 5.0
+    # Sizes have the noise of a reader, too.
+    size, normal = data.table.size[rows], torch.randn
+    size_sd = _SIZE_SD * torch.rand((len(rows), 1, 1), generator=generator)
+    size = size * (size_sd * normal(size.shape, generator=generator)).exp()
     noisy = Reading(
         ObjectPoses(true.position_m + shift, true.axes + turn, true.present),
         torch.hypot(sd_m, data.table.placed_sd_m[rows]),
-        _read_size(data.table.size[rows], generator),
+        size,
     )
     known = data.table.labelled[rows] & data.table.knows_all(start_step)[rows]
     known &= ~data.table.touched[rows] & (not data.starts_read)
@@ -200,14 +192,6 @@ def _read_start(
         return noisy
     read: Reading = mapped(data.readings[start_step], lambda values: values[rows])
     return chosen(known, noisy, read)
-
-
-def _read_size(
-    true: Float32[Tensor, "batch objects 2"], generator: torch.Generator
-) -> Float32[Tensor, "batch objects 2"]:
-    """Sizes with the noise of a reader, whose standard deviation is up to `_SIZE_SD`."""
-    sd = _SIZE_SD * torch.rand((len(true), 1, 1), generator=generator)
-    return true * (sd * torch.randn(true.shape, generator=generator)).exp()
 
 
 def _held_still(part: Part, held: Bool[Tensor, " batch"]) -> Part:
@@ -220,8 +204,8 @@ def core_loss(
 ) -> Float32[Tensor, ""]:
     """Weighted sum of the errors in objects, touch, contact and final success.
 
-    Where hands are held still without contact, the targets are no motion and no change of touch. A
-    change of it needs a new `CORE_VERSION` (`state_trainer`).
+    Of hands held still without contact, the targets are no motion and the same touch. A change of
+    it needs a new `CORE_VERSION` (`state_trainer`).
     """
     commands, start = batch.commands, batch.start
     table, rows = data.table, batch.rows
@@ -235,7 +219,7 @@ def core_loss(
     if not (weights.objects or weights.touch or weights.contact or weights.taxels):
         return success
     counted = table.measured_within(rows, batch.start_step)
-    latents = table.latent_steps(batch.start_step)
+    latents = torch.arange(batch.start_step, table.num_steps, STEPS_PER_LATENT)
     true = mapped(table.objects, lambda values: values[rows][:, latents])
     true = replace(_held_still(true, batch.is_held), present=true.present)
     known = start.objects.present[:, None] * table.labelled[rows, None, None]

@@ -1,12 +1,9 @@
-"""Episodes that the paper's form is trained on, and the windows that are drawn from them.
-
-Episodes are read once and cut with the re-anchoring of the store's reader. For data larger than
-memory, they stay on disk, and a window is read through that reader, its span alone.
-"""
+"""Episodes that the paper's form is trained on, in memory or on disk, and their windows."""
 
 import hashlib
-from collections.abc import Callable, Collection, Generator, Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from abc import ABC, abstractmethod
+from collections.abc import Collection, Generator, Iterable, Sequence
+from dataclasses import dataclass, field, fields, replace
 from functools import lru_cache
 from typing import Any, Final, TypeAlias, TypeVar
 
@@ -29,8 +26,12 @@ from dextouch.hands.actions import AnchorPoses, poses_from_actions, reanchor
 from dextouch.schemas import ActionKind, Domain
 from dextouch.streams import HEAD_CAMERA
 from dextouch.tactile.layout import DEXTOUCH_V1, NUM_TAXELS, TactileLayout
-from services.world_model.network.inputs import ObjectsAtStart, PredictionRequest
-from services.world_model.network.past import PastImages, PastRule
+from services.world_model.network.inputs import (
+    ObjectsAtStart,
+    PastImages,
+    PastRule,
+    PredictionRequest,
+)
 
 # What an episode must have for windows to be cut from it.
 CUT: Final = (needs.EVERY_PART, needs.EVERY_IMAGE)
@@ -59,32 +60,129 @@ class WindowPosition:
 
 
 @dataclass(frozen=True)
-class EpisodeArrays:
-    """One episode on the model grid, ready for cutting; actions are relative to its step 0.
+class Window:
+    """One slice of an episode: the request to the model and the true future."""
 
-    `further` are the images of further views, None of those that the episode lacks.
+    request: PredictionRequest
+    images: UInt8[np.ndarray, "time h w 3"]
+    tactile_kpa: Float32[np.ndarray, "time 2 taxels"]
+    tactile_valid: Bool[np.ndarray, "time 2"]
+    measured_taxels: Bool[np.ndarray, "2 taxels"]
+    further: UInt8[np.ndarray, "views time h w 3"] | None = None
+
+
+Steps: TypeAlias = Int64[np.ndarray, " n"]
+
+
+@dataclass(frozen=True)
+class _Span:
+    """What a window takes from an episode beside images.
+
+    `actions` from the step `first` on are relative to `anchor`, the measured poses of that step.
     """
+
+    instruction: str
+    first: int
+    anchor: AnchorPoses
+    K_head: Float64[np.ndarray, "3 3"]
+    actions: dict[ActionKind, Float64[np.ndarray, "steps 67"]]
+    touch: tuple[np.ndarray, np.ndarray, np.ndarray]
+    objects: ObjectsAtStart | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Episode(ABC):
+    """What is known of an episode that windows are cut from, in memory or on disk."""
 
     episode_id: str
     task: str
-    instruction: str
     scene: str
+    model_rate_hz: float
+    content_sha256: str
+    domain: Domain = "robot"
+    interpolated: Bool[np.ndarray, " steps"] | None = None
+    tactile_layout: TactileLayout = DEXTOUCH_V1
+
+    @property
+    @abstractmethod
+    def missing(self) -> tuple[bool, ...]:
+        """Which further views the episode lacks."""
+
+    @abstractmethod
+    def _span(self, place: WindowPosition, first: int) -> _Span:
+        """What the window takes, with actions from a step on, or from an earlier one."""
+
+    @abstractmethod
+    def _images_at(self, steps: Steps, view: int) -> UInt8[np.ndarray, "n h w 3"] | None:
+        """Images of the head (0) or of a further view; None of one that is missing."""
+
+    def cut(self, place: WindowPosition) -> Window:
+        """Cut the window at a place in this episode, and re-anchor its actions to its first step.
+
+        Commanded actions `from_command` are anchored as those of a served rollout after its first
+        chunk, since it measures no pose.
+
+        Raises:
+            InvalidInputError, UnknownNameError, CorruptDataError: as `EpisodeReader.window`.
+        """
+        steps = np.arange(place.start, place.start + place.num_steps)
+        kept = steps[:0] if place.past is None else place.past.steps(place.start)
+        span = self._span(place, int(min([*kept[:1], place.start])))
+        known = span.actions[place.action_kind]
+        origin_kind = place.action_kind if place.from_command else "measured"
+        origin = span.actions[origin_kind][place.start - span.first]
+        actions = reanchor(known[steps - span.first], 0, anchor_action=origin)
+
+        def views_at(chosen: Steps) -> list[np.ndarray | None]:
+            views = range(len(self.missing))
+            shown = [None if i in place.hidden else self._images_at(chosen, 1 + i) for i in views]
+            return [self._images_at(chosen, 0), *shown]
+
+        past = None
+        if place.past is not None and len(kept):
+            poses = reanchor(known[kept - span.first], 0, anchor_action=origin)
+            rows = place.past.chosen(poses, actions)
+            images = np.stack(_filled(views_at(kept[rows])), axis=1)
+            past = PastImages(poses[rows], place.start - kept[rows], images)
+        views = views_at(steps)
+        head, *further = _filled(views)
+        request = PredictionRequest(
+            first_image=head[0],
+            first_tactile_kpa=span.touch[0][0],
+            actions=actions,
+            action_kind=place.action_kind,
+            instruction=span.instruction,
+            anchor=poses_from_actions(origin[None], span.anchor).anchor(0),
+            K_head=span.K_head,
+            objects=span.objects,
+            further_images=tuple(None if one is None else one[0] for one in views[1:]),
+            past=past,
+        )
+        return Window(request, head, *span.touch, np.stack(further) if further else None)
+
+
+def _filled(views: Sequence[np.ndarray | None]) -> list[UInt8[np.ndarray, "n h w 3"]]:
+    """Images of all views, black where one is missing."""
+    like = next(one for one in views if one is not None)
+    return [np.zeros_like(like) if one is None else one for one in views]
+
+
+@dataclass(frozen=True, kw_only=True)
+class EpisodeArrays(_Episode):
+    """One episode on the model grid; actions are relative to its step 0, missing views None."""
+
+    instruction: str
     images: UInt8[np.ndarray, "steps h w 3"]
     tactile_kpa: Float32[np.ndarray, "steps 2 taxels"]
     tactile_valid: Bool[np.ndarray, "steps 2"]
     actions: dict[ActionKind, Float64[np.ndarray, "steps 67"]]
     anchor: AnchorPoses
     K_head: Float64[np.ndarray, "3 3"]
-    model_rate_hz: float
-    content_sha256: str
-    domain: Domain = "robot"
     object_poses: Float32[np.ndarray, "steps objects 7"] | None = None
     boxes_m: Float64[np.ndarray, "objects 6"] | None = None
-    interpolated: Bool[np.ndarray, " steps"] | None = None
     measured_taxels: Bool[np.ndarray, "2 taxels"] = field(
         default_factory=lambda: np.ones((2, NUM_TAXELS), dtype=np.bool_)
     )
-    tactile_layout: TactileLayout = DEXTOUCH_V1
     further: tuple[UInt8[np.ndarray, "steps h w 3"] | None, ...] = ()
 
     def __len__(self) -> int:
@@ -107,10 +205,7 @@ class EpisodeArrays:
         return tuple(self.actions)
 
     def fingerprint(self) -> str:
-        """SHA-256 of observations and actions; identifies equal data under another name.
-
-        Checkpoints list those of their training episodes, so that none of them is held out later.
-        """
+        """SHA-256 of observations and actions, by which checkpoints list training episodes."""
         digest = hashlib.sha256()
         digest.update(np.ascontiguousarray(self.images).tobytes())
         digest.update(np.ascontiguousarray(self.tactile_kpa, dtype="<f4").tobytes())
@@ -122,91 +217,15 @@ class EpisodeArrays:
             digest.update(np.ascontiguousarray(rounded, dtype="<f8").tobytes())
         return digest.hexdigest()
 
-    def cut(self, place: WindowPosition) -> "Window":
-        """Cut the window at a place in this episode, and re-anchor its actions to its first step.
+    def _images_at(self, steps: Steps, view: int) -> UInt8[np.ndarray, "n h w 3"] | None:
+        images = (self.images, *self.further)[view]
+        return None if images is None else images[steps]
 
-        Commanded actions `from_command` are anchored as those of a served rollout after its first
-        chunk, since it measures no pose.
-        """
+    def _span(self, place: WindowPosition, _: int) -> _Span:
         steps = slice(place.start, place.start + place.num_steps)
-        origin_kind = place.action_kind if place.from_command else "measured"
-        origin = self.actions[origin_kind][place.start]
-        request = PredictionRequest(
-            first_image=self.images[place.start],
-            first_tactile_kpa=self.tactile_kpa[place.start],
-            actions=reanchor(self.actions[place.action_kind][steps], 0, anchor_action=origin),
-            action_kind=place.action_kind,
-            instruction=self.instruction,
-            anchor=poses_from_actions(origin[None], self.anchor).anchor(0),
-            K_head=self.K_head,
-            objects=self.objects_at(place.start),
-        )
-        views = [None if i in place.hidden else one for i, one in enumerate(self.further)]
-        actions = self.actions[place.action_kind]
-        past = _past_of(
-            place,
-            request.actions,
-            lambda kept: reanchor(actions[kept], 0, anchor_action=origin),
-            lambda chosen: [None if one is None else one[chosen] for one in (self.images, *views)],
-        )
-        further = tuple(None if one is None else one[steps] for one in views)
-        return _window(
-            replace(request, past=past),
-            (self.images[steps], *further),
-            (self.tactile_kpa[steps], self.tactile_valid[steps], self.measured_taxels),
-        )
-
-
-# Images of the head, then of further views, None of those that are missing.
-Views: TypeAlias = Sequence[UInt8[np.ndarray, "n h w 3"] | None]
-
-
-def _past_of(
-    place: WindowPosition,
-    actions: Float64[np.ndarray, "time 67"],
-    actions_at: Callable[[Int64[np.ndarray, " n"]], Float64[np.ndarray, "n 67"]],
-    images_at: Callable[[Int64[np.ndarray, " n"]], Views],
-) -> PastImages | None:
-    """What a window at a place with these actions remembers.
-
-    `actions_at` gives actions of steps relative to the window's anchor, and `images_at` their
-    images.
-    """
-    kept = np.zeros(0, dtype=np.int64) if place.past is None else place.past.steps(place.start)
-    if place.past is None or not len(kept):
-        return None
-    known = actions_at(kept)
-    rows = place.past.chosen(known, actions)
-    images = np.stack(_filled(images_at(kept[rows])), axis=1)
-    return PastImages(known[rows], place.start - kept[rows], images)
-
-
-def _filled(views: Views) -> list[UInt8[np.ndarray, "n h w 3"]]:
-    """Images of all views, black where one is missing."""
-    like = next(one for one in views if one is not None)
-    return [np.zeros_like(like) if one is None else one for one in views]
-
-
-def _window(
-    request: PredictionRequest, views: Views, touch: tuple[np.ndarray, np.ndarray, np.ndarray]
-) -> "Window":
-    """The window of a request, of all its images, and of touch, its validity and its taxels."""
-    head, *further = _filled(views)
-    firsts = tuple(None if one is None else one[0] for one in views[1:])
-    stacked = np.stack(further) if further else None
-    return Window(replace(request, further_images=firsts), head, *touch, stacked)
-
-
-@dataclass(frozen=True)
-class Window:
-    """One slice of an episode: the request to the model and the true future."""
-
-    request: PredictionRequest
-    images: UInt8[np.ndarray, "time h w 3"]
-    tactile_kpa: Float32[np.ndarray, "time 2 taxels"]
-    tactile_valid: Bool[np.ndarray, "time 2"]
-    measured_taxels: Bool[np.ndarray, "2 taxels"]
-    further: UInt8[np.ndarray, "views time h w 3"] | None = None
+        touch = self.tactile_kpa[steps], self.tactile_valid[steps], self.measured_taxels
+        objects = self.objects_at(place.start)
+        return _Span(self.instruction, 0, self.anchor, self.K_head, self.actions, touch, objects)
 
 
 @dataclass(frozen=True)
@@ -235,10 +254,9 @@ def stack_windows(windows: Sequence[Window]) -> WindowBatch:
 def read_episode(
     reader: EpisodeReader, *, image_px: int | None = None, further_views: Sequence[str] = ()
 ) -> EpisodeArrays:
-    """Read a whole episode.
+    """Read a whole episode, the middle square of larger images scaled to `image_px`.
 
-    The middle square of images that are larger than `image_px` is scaled to it. Of the further
-    views, those are missing that have no image of nearly every step.
+    Further views are missing without an image of nearly every step.
 
     Raises:
         InvalidInputError: the image of a step is missing.
@@ -258,7 +276,9 @@ def read_episode(
         scene=grid.scene,
         images=grid.images(range(len(grid))),
         further=tuple(
-            grid.images(range(len(grid)), view) if has_view(reader, view) else None
+            grid.images(range(len(grid)), view)
+            if view in reader.streams and reader.has_every_image(view)
+            else None
             for view in further_views
         ),
         tactile_kpa=tactile_kpa,
@@ -277,40 +297,20 @@ def read_episode(
     )
 
 
-def has_view(reader: EpisodeReader, camera: str) -> bool:
-    """Whether an episode has images of a further view at nearly every step."""
-    return camera in reader.streams and reader.has_every_image(camera)
-
-
 @lru_cache(maxsize=MAX_OPEN_READERS)
 def _reader(url: str, episode_id: str) -> EpisodeReader:
     return EpisodeStore(url).open(episode_id)
 
 
-# What a stored episode has of its arrays.
-_SHARED: Final = (
-    "episode_id", "task", "scene", "action_kinds", "content_sha256", "domain", "model_rate_hz",
-    "interpolated", "tactile_layout", "missing",
-)  # fmt: skip
-
-
-@dataclass(frozen=True)
-class StoredEpisode:
+@dataclass(frozen=True, kw_only=True)
+class StoredEpisode(_Episode):
     """One episode that stays on disk; created by `index_episodes`."""
 
     url: str
-    episode_id: str
-    task: str
-    scene: str
     num_steps: int
     action_kinds: tuple[ActionKind, ...]
-    content_sha256: str
     print_sha256: str
-    domain: Domain
-    model_rate_hz: float
     image_px: int | None = None
-    interpolated: Bool[np.ndarray, " steps"] | None = None
-    tactile_layout: TactileLayout = DEXTOUCH_V1
     missing: tuple[bool, ...] = ()
     further_views: tuple[str, ...] = ()
 
@@ -329,67 +329,25 @@ class StoredEpisode:
             further_views=self.further_views,
         )
 
-    def cut(self, place: WindowPosition) -> Window:
-        """Read the window at a place in this episode.
+    def _grid(self) -> EpisodeGrid:
+        return EpisodeGrid(_reader(self.url, self.episode_id), self.image_px)
 
-        Raises:
-            InvalidInputError: steps outside the episode.
-            UnknownNameError: an action kind that it does not have.
-            CorruptDataError: damaged bytes.
-        """
-        grid, kind = (
-            EpisodeGrid(_reader(self.url, self.episode_id), self.image_px),
-            place.action_kind,
-        )
-        read = grid.reader.window(place.start, place.num_steps, cameras=(), action_kind=kind)
-        actions, anchor = read.actions, read.anchor
-        if place.from_command and place.action_kind == "commanded":
-            anchor = poses_from_actions(actions[:1], anchor).anchor(0)
-            actions = reanchor(actions, 0)
-        steps = np.arange(place.start, place.start + place.num_steps)
-        cameras = [
-            None if absent or index in place.hidden else name
-            for index, (name, absent) in enumerate(
-                zip(self.further_views, self.missing, strict=True)
-            )
-        ]
+    def _images_at(self, steps: Steps, view: int) -> UInt8[np.ndarray, "n h w 3"] | None:
+        names = HEAD_CAMERA, *self.further_views
+        return None if (False, *self.missing)[view] else self._grid().images(steps, names[view])
 
-        def images_at(chosen: Int64[np.ndarray, " n"]) -> Views:
-            further = [None if name is None else grid.images(chosen, name) for name in cameras]
-            return [grid.images(chosen), *further]
-
-        images = images_at(steps)
-        objects = None
-        if known := grid.boxed_objects(read.t_ref_ns[:1]):
+    def _span(self, place: WindowPosition, first: int) -> _Span:
+        grid, kind = self._grid(), place.action_kind
+        tactile_kpa, valid = grid.reader.touch(place.start, place.num_steps)
+        count = place.start + place.num_steps - first
+        kinds: set[ActionKind] = {"measured", kind}
+        actions = {one: grid.reader.actions(first, count, kind=one) for one in kinds}
+        objects, now_ns = None, grid.t_ref_ns[place.start : place.start + 1]
+        if known := grid.boxed_objects(now_ns):
             objects = ObjectsAtStart(known[0][0].astype(np.float64), known[1])
-        head = _filled(images)[0]
-        request = PredictionRequest(
-            first_image=head[0],
-            first_tactile_kpa=read.tactile_kpa[0],
-            actions=actions,
-            action_kind=place.action_kind,
-            instruction=read.instruction,
-            anchor=anchor,
-            K_head=grid.K_head,
-            objects=objects,
-        )
-        past = _past_of(place, actions, lambda kept: self._actions_at(place, kept), images_at)
-        return _window(
-            replace(request, past=past),
-            images,
-            (read.tactile_kpa, read.tactile_valid, read.taxels_measured),
-        )
-
-    def _actions_at(
-        self, place: WindowPosition, steps: Int64[np.ndarray, " n"]
-    ) -> Float64[np.ndarray, "n 67"]:
-        """Actions of earlier steps, relative to the anchor of the window at a place."""
-        reader, kind, last = _reader(self.url, self.episode_id), place.action_kind, place.start + 1
-        origin_kind = kind if place.from_command else "measured"
-        # All of them relative to the poses of step 0.
-        of_kind = reader.actions(0, last, kind=kind)
-        origin = reader.actions(0, last, kind=origin_kind)[place.start]
-        return reanchor(of_kind[steps], 0, anchor_action=origin)
+        touch = tactile_kpa, valid, grid.measured_taxels
+        about, anchor = grid.about.instruction, grid.reader.anchor(first)
+        return _Span(about, first, anchor, grid.K_head, actions, touch, objects)
 
 
 # An episode that windows are cut from.
@@ -407,13 +365,12 @@ def window_starts(episode: TrainingEpisode, num_steps: int) -> Int64[np.ndarray,
 
 
 class WindowSampler:
-    """Samples windows uniformly over starts, and over the episodes of each domain.
+    """Samples windows of measured steps uniformly over starts, and over episodes of each domain.
 
-    Windows have no interpolated step. Episodes have one of `max_steps` at least. Of windows from
-    episodes with commanded actions, half have them, and 30 % of these are anchored like a later
-    chunk. `human_share` is that of windows from human episodes, if there are human and robot ones;
-    None: every episode is equally likely. `past` says which images are remembered, and `dropout`
-    has the shares of windows that remember none, and of those without each further view.
+    Of windows from episodes with commanded actions, half have them, and 30 % of these are anchored
+    like a later chunk. `human_share` is that of windows from human episodes, if there are both;
+    None: every episode is equally likely. `dropout` has the shares of windows that remember no
+    past, and of those without each further view.
     """
 
     def __init__(
@@ -435,10 +392,8 @@ class WindowSampler:
             )
         self._episodes = list(episodes)
         self._rng = rng
-        of: dict[Domain, list[int]] = {"human": [], "robot": []}
-        for index, episode in enumerate(episodes):
-            of[episode.domain].append(index)
-        self._human, self._robot = of["human"], of["robot"]
+        self._human = [i for i, episode in enumerate(episodes) if episode.domain == "human"]
+        self._robot = [i for i, episode in enumerate(episodes) if episode.domain == "robot"]
         self._human_share = human_share if self._human and self._robot else None
         self._past, (self._past_dropout, self._view_dropout) = past, dropout
 
@@ -454,30 +409,27 @@ class WindowSampler:
         """The windows at these places."""
         return stack_windows([self._episodes[p.episode_index].cut(p) for p in places])
 
-    def _episode_index(self) -> int:
-        if self._human_share is None:
-            return int(self._rng.integers(len(self._episodes)))
-        is_human = self._rng.random() < self._human_share
-        chosen = self._human if is_human else self._robot
-        return chosen[int(self._rng.integers(len(chosen)))]
-
     def _place(self, num_steps: int) -> WindowPosition:
-        index = self._episode_index()
+        able: Sequence[int] = range(len(self._episodes))
+        if self._human_share is not None:
+            able = self._human if self._rng.random() < self._human_share else self._robot
+        index = able[int(self._rng.integers(len(able)))]
         episode = self._episodes[index]
         starts = window_starts(episode, num_steps)
         start = int(starts[self._rng.integers(len(starts))])
-        is_commanded = self._rng.random() < _COMMANDED_SHARE
+        is_commanded = bool(self._rng.random() < _COMMANDED_SHARE)
         is_chained = bool(self._rng.random() < _CHAINED_SHARE)
+        is_commanded &= "commanded" in episode.action_kinds
         past, hidden = self._past, frozenset[int]()
         if past is not None and self._rng.random() < self._past_dropout:
             past = replace(past, kept=0)
         if num_views := len(episode.missing):
             rows = np.flatnonzero(self._rng.random(num_views) < self._view_dropout)
             hidden = frozenset(rows.tolist())
-        if not is_commanded or "commanded" not in episode.action_kinds:
-            return WindowPosition(index, start, num_steps, past=past, hidden=hidden)
+        kind: ActionKind = "commanded" if is_commanded else "measured"
+        is_chained &= is_commanded
         return WindowPosition(
-            index, start, num_steps, "commanded", from_command=is_chained, past=past, hidden=hidden
+            index, start, num_steps, kind, from_command=is_chained, past=past, hidden=hidden
         )
 
 
@@ -489,13 +441,7 @@ def load_episodes(
     image_px: int | None = None,
     further_views: Sequence[str] = (),
 ) -> list[EpisodeArrays]:
-    """Episodes of a store, read once into memory: those of the given splits and domain.
-
-    Images are as `read_episode` says.
-
-    Raises:
-        NotFoundError, ConflictError: as `select_episodes`.
-    """
+    """Episodes of a store in memory; raises as `select_episodes` and `read_episode`."""
     readers = select_episodes([EpisodeStore(url)], domain=domain, splits=splits, needs=CUT)
     return [read_episode(one, image_px=image_px, further_views=further_views) for one in readers]
 
@@ -517,11 +463,13 @@ def index_episodes(
         arrays = read_episode(
             _reader(url, found.item_id), image_px=image_px, further_views=further_views
         )
-        shared: dict[str, Any] = {name: getattr(arrays, name) for name in _SHARED}
+        shared: dict[str, Any] = {one.name: getattr(arrays, one.name) for one in fields(_Episode)}
         indexed.append(
             StoredEpisode(
                 url=url,
                 num_steps=len(arrays),
+                action_kinds=arrays.action_kinds,
+                missing=arrays.missing,
                 print_sha256=arrays.fingerprint(),
                 image_px=image_px,
                 further_views=tuple(further_views),
@@ -547,11 +495,7 @@ def read_batches(
     *,
     num_workers: int = 0,
 ) -> Generator[WindowBatch, None, None]:
-    """Batches at these places, in order, independent of the number of processes.
-
-    Places may be endless and are read ahead. Reader processes end with the iterator; without any,
-    this process reads.
-    """
+    """Batches at these places, maybe endless, in order, whatever the number of reader processes."""
     loader = DataLoader(
         _Windows(episodes),
         batch_sampler=places,

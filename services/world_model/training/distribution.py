@@ -1,7 +1,6 @@
 """Processes of a training run that share its batches and its weights (FSDP2), under torchrun.
 
-Every process draws the windows and the noise of the whole batch from the same seed and keeps its
-own part, so that losses and weights do not depend on the number of processes, except for rounding.
+Each draws windows and noise of the whole batch from the same seed and keeps its own part.
 """
 
 import os
@@ -29,10 +28,7 @@ Whole = TypeVar("Whole", Tensor, list[Any])
 
 @dataclass(frozen=True)
 class Processes:
-    """Processes of one run; without torchrun there is one, with no `mesh`.
-
-    A mesh of two dimensions has several copies of the model, each sharded over its own processes.
-    """
+    """Processes of one run; one without `mesh`, which of two dimensions has copies of the model."""
 
     rank: int = 0
     count: int = 1
@@ -44,12 +40,7 @@ class Processes:
         return self.rank == 0
 
     def check(self, batch: int, accumulate: int) -> None:
-        """Refuse a batch that cannot be divided.
-
-        Raises:
-            InvalidInputError: not a multiple of the number of processes times that of the parts
-                that each computes one after the other.
-        """
+        """Raise InvalidInputError unless a batch can be divided into parts of each process."""
         if batch % (self.count * accumulate):
             raise InvalidInputError(
                 f"training: got batches of {batch} windows for {self.count} processes with "
@@ -87,10 +78,7 @@ class Processes:
     def shard(
         self, model: nn.Module, layers: nn.ModuleList, whole: Collection[nn.Module] = ()
     ) -> None:
-        """Keep only this process's share of every weight, gathered layer by layer.
-
-        Parts that are used outside of `forward` stay whole, as do all buffers. Weights may be on
-        the meta device still; others move to the mesh's.
+        """Keep this process's share of every weight, gathered layer by layer, but of `whole`.
 
         Raises:
             InvalidInputError: learned weights of several precisions.
@@ -116,17 +104,10 @@ _BACKENDS: Final = {"cpu": "gloo", "cuda": "cpu:gloo,cuda:nccl"}
 
 @contextmanager
 def joined_processes(device: str = "cpu", replicas: int = 1) -> Iterator[Processes]:
-    """The processes that torchrun started; `ALONE` without it.
-
-    On cuda, each takes the GPU of its number on its machine.
-
-    Args:
-        device: cpu or cuda.
-        replicas: copies of the sharded model, such as one for each machine.
+    """The processes that torchrun started, on cuda each with its own GPU; `ALONE` without it.
 
     Raises:
-        InvalidInputError: another device, or a number of processes that is no multiple of the
-            copies.
+        InvalidInputError: another device, or processes that are no multiple of `replicas`.
         UnavailableError: fewer GPUs than processes on this machine.
     """
     if not distributed.is_torchelastic_launched():

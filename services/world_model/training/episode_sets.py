@@ -3,13 +3,16 @@
 import hashlib
 from collections import Counter
 from collections.abc import Collection, Iterable, Sequence
+from functools import partial
 from typing import TypeAlias, TypeVar
 
-from dextouch.episodes import EpisodeGrid, data_hash
+from dextouch.episodes import EpisodeGrid, data_hash, split_by_scene
 from dextouch.errors import ConflictError, InvalidInputError
 from dextouch.schemas import Domain
-from services.world_model.checkpoints import TrainingSet
+from services.world_model.checkpoints import TrainingSet, read_tokenizer
+from services.world_model.paper_settings import TrainSettings
 from services.world_model.settings import DataSettings
+from services.world_model.training import dataset, tokenizer_trainer
 from services.world_model.training.dataset import TrainingEpisode
 
 # An episode of either form of the world model.
@@ -18,13 +21,7 @@ D = TypeVar("D", bound=DomainEpisode)
 
 
 def subset_by_hash(episodes: Sequence[D], count: int | None, *, what: str) -> list[D]:
-    """A number of episodes chosen by their content, in their order; None for all.
-
-    A larger subset of the same episodes contains every smaller one.
-
-    Raises:
-        InvalidInputError: there are fewer; `what` names them.
-    """
+    """Episodes by content, in their order, more contain fewer; None: all. `what` is for errors."""
     if count is None:
         return list(episodes)
     if count > len(episodes):
@@ -41,11 +38,7 @@ def subset_by_hash(episodes: Sequence[D], count: int | None, *, what: str) -> li
 
 
 def check_stores(urls: Iterable[str], ids: Iterable[str], rates_hz: Collection[float]) -> None:
-    """Check that the episodes of a training have one model rate, and are in one store each.
-
-    Raises:
-        ConflictError: they are not.
-    """
+    """Raise ConflictError unless episodes have one model rate, and are in one store each."""
     twice = [name for name, count in Counter(ids).items() if count > 1]
     if twice or len(rates_hz) > 1:
         raise ConflictError(
@@ -57,9 +50,7 @@ def check_stores(urls: Iterable[str], ids: Iterable[str], rates_hz: Collection[f
 def check_tasks(
     episodes: Iterable[DomainEpisode], settings: DataSettings, known: Collection[str] = ()
 ) -> None:
-    """Check that tasks are of one domain (`disjoint_tasks`) and new (`new_tasks`).
-
-    `known` are those that the initial checkpoint was trained on.
+    """Check that tasks are of one domain (`disjoint_tasks`) and new (`new_tasks`), not `known`.
 
     Raises:
         InvalidInputError: a task is both human and robot, or is known already.
@@ -94,8 +85,7 @@ def training_sets(
 ) -> tuple[TrainingSet, ...]:
     """The episodes of a run by domain, after the inherited ones of its ancestors.
 
-    `ancestor` is the digest of the initial checkpoint. `human_share` of what is drawn is human;
-    None: as their number says. `image_px` is as for `data_hash`.
+    `ancestor` is the digest of the initial checkpoint; `human_share` None: as their number says.
     """
     found = [
         one if one.checkpoint else one.model_copy(update={"checkpoint": ancestor})
@@ -118,3 +108,80 @@ def training_sets(
                 )
             )
     return tuple(found)
+
+
+def load_split(
+    settings: TrainSettings,
+) -> tuple[Sequence[TrainingEpisode], list[dataset.EpisodeArrays]]:
+    """Training and held-out episodes; the latter, in memory, are the same for every subset.
+
+    They are never human if human stores are given.
+    """
+    px, views = settings.network.image_px, settings.network.further_views
+    how = dataset.index_episodes if settings.streaming else dataset.load_episodes
+    read = partial(how, splits=settings.splits, image_px=px, further_views=views)
+    domain: Domain | None = "robot" if settings.human else None
+    trained: Sequence[TrainingEpisode] = read(settings.episodes, domain=domain)
+    if settings.heldout is not None:
+        heldout = dataset.load_episodes(
+            settings.heldout, domain=domain, image_px=px, further_views=views
+        )
+    else:
+        trained, stored = _split(trained, settings)
+        heldout = [one.load() if isinstance(one, dataset.StoredEpisode) else one for one in stored]
+    trained = subset_by_hash(trained, settings.robot_episodes, what="robot")
+    people: list[TrainingEpisode] = []
+    for url in settings.human if settings.human_episodes != 0 else ():
+        people += read(url, domain="human")
+    together = [
+        *trained,
+        *subset_by_hash(people, settings.human_episodes, what="human"),
+    ]
+    rates_hz = {episode.model_rate_hz for episode in (*together, *heldout)}
+    ids = [episode.episode_id for episode in together]
+    check_stores([settings.episodes, *settings.human], ids, rates_hz)
+    _check_views([*together, *heldout], settings)
+    return together, heldout
+
+
+def _check_views(episodes: Sequence[TrainingEpisode], settings: TrainSettings) -> None:
+    """Raise unless every further view is in an episode, or in all if none may be left out."""
+    share = settings.windows.view_dropout
+    for index, view in enumerate(settings.network.further_views):
+        without = [episode.episode_id for episode in episodes if episode.missing[index]]
+        if len(without) == len(episodes) or (without and not share):
+            raise InvalidInputError(
+                f"training: {len(without)} of {len(episodes)} episodes have no images of {view} at "
+                f"nearly every step {without[:3]}, expected it in "
+                f"{'some' if share else 'all'}; record that camera (in the twin by `dextouch train "
+                "data --wrist-cameras`), leave it out of --network.further-views, or, where some "
+                "have it, train with --windows.view-dropout above 0"
+            )
+
+
+def _split(
+    episodes: Sequence[dataset.E], settings: TrainSettings
+) -> tuple[list[dataset.E], list[dataset.E]]:
+    if settings.tokenizer is None:
+        return split_by_scene(episodes, held_out_share=settings.heldout_percent / 100)
+    stored = read_tokenizer(settings.tokenizer)
+    return tokenizer_trainer.split_unseen(
+        episodes, stored, heldout_percent=settings.heldout_percent
+    )
+
+
+def check_disjoint(trained: Sequence[TrainingEpisode], heldout: Sequence[TrainingEpisode]) -> None:
+    """Raise if a held-out episode, or its scene, is also trained on."""
+    prints = {episode.fingerprint() for episode in trained}
+    scenes = {episode.scene for episode in trained}
+    both = [
+        episode.episode_id
+        for episode in heldout
+        if episode.fingerprint() in prints or episode.scene in scenes
+    ]
+    if both:
+        raise InvalidInputError(
+            f"training: {len(both)} held-out episodes are also trained on {both[:3]} (same content "
+            "or same scene); expected disjoint sets",
+            episodes=both,
+        )

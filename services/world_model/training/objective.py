@@ -1,14 +1,13 @@
 """Training losses: flow matching of video and tactile latents, and self-forcing.
 
-Self-forcing (Huang et al. 2025) trains on the model's own samples, as at deployment, where a chunk
-starts from the last prediction, and a sampler calls the network with latents of its own. The
-context of half the batches is predicted, and noisy latents are those that the sampler itself
-reaches; the target is always the recorded future.
+Self-forcing (Huang et al. 2025) trains on the model's own samples, as at deployment: contexts of
+half the batches are predicted, and noisy latents are those that the sampler reaches.
 """
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Literal, TypeVar
+from functools import partial
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Bool, Float32
@@ -40,7 +39,6 @@ from services.world_model.training.dataset import WindowBatch
 from services.world_model.training.distribution import ALONE, Processes
 
 TouchLoss = Literal["all", "contact_or_changing"]
-_Part = TypeVar("_Part")
 # A taxel that differs by this much from the step before is changing.
 CHANGE_KPA = 0.5
 OWN_CONTEXT_SHARE = 0.5
@@ -58,12 +56,10 @@ class Losses:
 class LossOptions:
     """Options of the losses.
 
-    `context_noise` is the relative deviation of noise on the first latents, for starts from own
-    output. `touch_loss` says which tactile tokens count: all, so that the absence of contact is
-    learned, too, or only those in contact or changing, as in the paper. `precision` is that of the
+    `context_noise` is the relative deviation of noise on the first latents. Of tactile tokens count
+    `touch_loss`: all, or those in contact or changing, as in the paper. `precision` is that of the
     experts' matrix products. With `own_noisy`, noisy latents are those of the model's own sampler.
-    `text_dropout` and `action_dropout` are the shares of windows without instruction, and
-    without actions, for guidance; the smaller share is without both.
+    `text_dropout` and `action_dropout` are shares of windows; the smaller one is without both.
     """
 
     context_noise: float = 0.0
@@ -78,8 +74,8 @@ class LossOptions:
 class Examples:
     """What the network is given for some windows, what it should answer, and how that counts.
 
-    `counted` weighs the errors of tactile tokens, and `num_counted` is their sum over the windows
-    of a step, per process; `share` is that of these windows in those of the process.
+    `counted` weighs errors of tactile tokens, `num_counted` is their sum over the windows of a
+    step, per process; `share` is that of these windows.
     """
 
     inputs: ModelInputs
@@ -95,35 +91,13 @@ class Examples:
         """The windows in equal parts, whose losses sum to that of all."""
         size = len(self.t) // count
         for start in range(0, len(self.t), size):
-            yield self._rows(range(start, start + size), self.share / count)
-
-    def _rows(self, rows: range, share: float) -> "Examples":
-        def own(part: _Part) -> _Part:
-            return mapped(part, lambda tensor: tensor[rows.start : rows.stop])
-
-        return Examples(
-            self.inputs.rows(rows),
-            own(self.first),
-            own(self.noisy),
-            own(self.t),
-            own(self.target),
-            own(self.counted),
-            self.num_counted,
-            share,
-        )
-
-
-def losses(
-    model: JointWorldModel,
-    batch: WindowBatch,
-    *,
-    generator: torch.Generator,
-    options: LossOptions = LossOptions(),
-    processes: Processes = ALONE,
-) -> Losses:
-    """Errors of the prediction at random times; see `examples_of` and `errors`."""
-    examples = examples_of(model, batch, generator=generator, options=options, processes=processes)
-    return errors(model, examples, options.precision)
+            rows = torch.arange(start, start + size, device=self.t.device)
+            own: dict[str, Any] = {
+                name: mapped(getattr(self, name), partial(torch.index_select, dim=0, index=rows))
+                for name in ("first", "noisy", "t", "target", "counted")
+            }
+            inputs, share = self.inputs.rows(rows.tolist()), self.share / count
+            yield replace(self, **own, inputs=inputs, share=share)
 
 
 def examples_of(
@@ -135,10 +109,7 @@ def examples_of(
     processes: Processes = ALONE,
     num_parts: int = 1,
 ) -> Examples:
-    """Windows with random times and noise.
-
-    The batches of all `processes` together are the whole one. Images are encoded in `num_parts`.
-    """
+    """Windows of this process with random times and noise; images are encoded in `num_parts`."""
     device = model.device
     inputs = model.with_past(build_inputs(batch.requests, model.config).to(device))
     if options.text_dropout or options.action_dropout:
@@ -179,11 +150,7 @@ def examples_of(
 
 
 def errors(model: JointWorldModel, examples: Examples, precision: Precision) -> Losses:
-    """Losses of examples.
-
-    They are contributions to those of the whole batch: of parts of it, which sum to that of a
-    process, and of processes, which have the whole one's as their mean.
-    """
+    """Losses of examples, which sum over parts to those of a process, whose mean is the batch's."""
     with products_in(precision, examples.t.device.type):
         guess = model(examples.inputs, examples.first, examples.noisy, examples.t)
     target = examples.target
@@ -206,11 +173,7 @@ def contact_or_changing(
     num_tokens: int,
     layout: TactileLayout = DEXTOUCH_V1,
 ) -> Bool[Tensor, "batch time 2 tokens"]:
-    """Tokens with a taxel in contact, at this or the first step, or changing since the last step.
-
-    In contact: at least 2 kPa; changing: by at least 0.5 kPa. With six tokens these are those of
-    the five fingertips and the palm, with one that of the whole hand.
-    """
+    """Tokens with a taxel in contact (≥ 2 kPa), now or first, or changing by at least 0.5 kPa."""
     before = torch.cat([tactile_kpa[:, :1], tactile_kpa[:, :-1]], dim=1)
     contact = tactile_kpa >= CONTACT_THRESHOLD_KPA
     taxels = contact | contact[:, :1] | ((tactile_kpa - before).abs() >= CHANGE_KPA)
@@ -238,13 +201,10 @@ def _with_noise(
 def own_context(
     model: JointWorldModel, batch: WindowBatch, *, generator: torch.Generator, processes: Processes
 ) -> WindowBatch:
-    """Windows of one chunk from windows of two.
-
-    Half of the batches are the second chunks, each with the last image and touch that the model
-    predicts for the first chunk; the others are the first chunks.
+    """Windows of one chunk from windows of two: of half the batches the second ones.
 
     Raises:
-        InvalidInputError: a model that is conditioned on contact geometry.
+        InvalidInputError: a model with contact geometry, further views or past images.
     """
     if model.config.use_contact_geometry:
         raise InvalidInputError(

@@ -23,7 +23,7 @@ from services.networks.optimizer import (
 from services.world_model.dynamics.features import DynamicsConfig, ObjectPoses
 from services.world_model.dynamics.start_reader import FirstStep, Reading, StartReader
 from services.world_model.dynamics.trees import combined
-from services.world_model.rendering.network import uses_bfloat16
+from services.world_model.rendering.renderer import uses_bfloat16
 from services.world_model.settings import CoreSettings, ReaderSettings
 from services.world_model.training.scene_table import SceneTable
 
@@ -56,11 +56,7 @@ def train_reader(
     on_step: OnStep | None = None,
     initial: StartReader | None = None,
 ) -> StartReader:
-    """Train a reader of objects from single steps, both first and later ones.
-
-    Only labelled episodes are used. The weights of `initial` are changed. `on_step` is called with
-    each step and its loss.
-    """
+    """Train a reader, or `initial`, on single steps of labelled episodes, first and later ones."""
     generator = torch.Generator().manual_seed(seed)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
@@ -68,7 +64,10 @@ def train_reader(
     _fit_heights(reader, table, config)
     later = [step for step in table.image_steps if step % 4 == 0 and step > 0]
     known = torch.nonzero(table.labelled)[:, 0]
-    is_known = _knows_some(table, config)
+    # Steps at which the pose of an object is known; all of tasks without objects.
+    counts = torch.tensor(config.num_objects)[table.task]
+    is_slot = torch.arange(MAX_OBJECTS) < counts[:, None]
+    is_known = (table.objects_known & is_slot[:, None]).any(-1) | (counts == 0)[:, None]
     # Later steps of each episode, in their order; of further ones nothing is known, they have no
     # image or lie behind its end.
     places = [table.image_steps.index(step) for step in later]
@@ -95,13 +94,6 @@ def train_reader(
         return _error(reading, *about) + _GUESS_WEIGHT * _error(guess, *about)
 
     return train_averaged(reader, loss, settings, weight_decay=_WEIGHT_DECAY, on_step=on_step)
-
-
-def _knows_some(table: SceneTable, config: DynamicsConfig) -> Bool[Tensor, "episodes steps"]:
-    """Steps at which the pose of an object is known; all of tasks without objects."""
-    count = torch.tensor(config.num_objects)[table.task]
-    is_slot = torch.arange(MAX_OBJECTS) < count[:, None]
-    return (table.objects_known & is_slot[:, None]).any(-1) | (count == 0)[:, None]
 
 
 def _fit_heights(reader: StartReader, table: SceneTable, config: DynamicsConfig) -> None:
@@ -153,10 +145,7 @@ def read_step(reader: StartReader, table: SceneTable, step: int) -> Reading:
 
 
 def reader_errors(reader: StartReader, table: SceneTable) -> dict[str, float]:
-    """Errors (mm) over the table at the first step of held-out episodes, by task.
-
-    They are the median and the 90 % quantile over present objects; tasks without are left out.
-    """
+    """Median and 90 % quantile of errors (mm) over the table at first steps, by task."""
     predicted, errors = read_step(reader, table, 0).objects, dict[str, float]()
     true = table.objects_at(torch.arange(len(table)), 0)
     for index, task in enumerate(reader.config.tasks):
@@ -173,10 +162,7 @@ def reader_errors(reader: StartReader, table: SceneTable) -> dict[str, float]:
 def as_another_camera(
     first: FirstStep, generator: torch.Generator
 ) -> tuple[Float32[Tensor, "batch 3 px px"], FirstStep]:
-    """Images in 0 … 1 that other cameras might take, and steps with the intrinsics of these.
-
-    A share of the images stays as it is.
-    """
+    """Images (0 … 1) as other cameras might take them, but for a share, and their intrinsics."""
     count, px = len(first.image), first.image.shape[1]
 
     def normal(*shape: int) -> Tensor:
@@ -238,10 +224,7 @@ def train_averaged(
     weight_decay: float,
     on_step: OnStep | None = None,
 ) -> Network:
-    """Train a network in place, and return the moving average of its weights.
-
-    `loss` draws a fresh batch. `on_step` is called with each step and its loss.
-    """
+    """Train a network in place on fresh batches of `loss`; returns its moving average."""
     options = OptimizerOptions(
         settings.learning_rate,
         weight_decay,

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Bool, Float16, Float32, Float64, Int64, Shaped, UInt8
-from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from dextouch.episodes import EpisodeGrid, ObjectTrack
@@ -113,10 +112,7 @@ class SceneTable:
         return self.tactile_kpa.shape[1]
 
     def movable(self) -> Float32[Tensor, "tasks objects"]:
-        """1 for objects that move in some labelled episode of their task, 0 for fixed ones.
-
-        One that is known at single steps alone, as by clicks, counts as moving.
-        """
+        """1 for objects that move in some labelled episode or are known once, 0 for fixed ones."""
         known = self.objects_known
         position_m, far = self.objects.position_m, torch.tensor(torch.inf)
         highest = torch.where(known[..., None], position_m, -far).amax(1)
@@ -181,10 +177,6 @@ class SceneTable:
         given = self.interpolated[rows][:, self.steps_after(start)].any(-1)
         return self.within(rows, start) & ~given
 
-    def latent_steps(self, start: int) -> Int64[Tensor, " latents"]:
-        """The start and every latent step after it."""
-        return torch.arange(start, self.num_steps, STEPS_PER_LATENT)
-
     def commands(self, rows: Tensor, start: int, use_measured: Bool[Tensor, " batch"]) -> Commands:
         """Measured hands at `start`, then the sent (or measured) ones until the end."""
         latents = torch.arange(start, self.num_steps - 1, STEPS_PER_LATENT)
@@ -232,7 +224,7 @@ class SceneTable:
 
 
 def vocabulary(episodes: Sequence[EpisodeGrid]) -> tuple[tuple[str, ...], tuple[int, ...]]:
-    """Tasks in alphabetical order with the number of objects of each.
+    """Tasks in alphabetical order with the number of objects of each, the same in all episodes.
 
     Raises:
         InvalidInputError: no episodes, or a task whose episodes differ in their objects.
@@ -265,8 +257,7 @@ def scene_table(
 ) -> SceneTable:
     """Build the tensors of episodes; what is left over of a latent step at an end is cut off.
 
-    `labelled` says of each whether its object poses are trained on; by default all. `human_share`
-    of what is drawn is human; None: as their number says.
+    `labelled` says of each whether its object poses are trained on; by default all.
 
     Raises:
         InvalidInputError: no image of the first step, none later that all episodes have, too short
@@ -349,10 +340,7 @@ def _touch(
 def filled_touch(
     episode: EpisodeGrid,
 ) -> tuple[Float32[np.ndarray, "steps 2 taxels"], Bool[np.ndarray, "steps 2"]]:
-    """Pressures (kPa), and where there was a sample, with unmeasured taxels filled.
-
-    They have the pressure of the nearest one of their pad that was measured, or none.
-    """
+    """Pressures (kPa) with unmeasured taxels as the nearest of their pad, and what was sampled."""
     touch_kpa, is_sampled = episode.touch()
     measured = episode.measured_taxels
     nearest = np.stack([_nearest_measured(hand, episode.tactile_layout) for hand in measured])
@@ -369,9 +357,9 @@ def _nearest_measured(
         return nearest
     for pad in [pad for stack in layout.split(nearest) for pad in stack]:
         if measured[pad].any():
-            away = ~measured[pad]
-            places = distance_transform_edt(away, return_distances=False, return_indices=True)
-            nearest[pad] = pad[tuple(places)]
+            cells, known = np.argwhere(np.ones(pad.shape)), np.argwhere(measured[pad])
+            away = np.square(cells[:, None] - known).sum(axis=-1)
+            nearest[pad.ravel()] = pad[tuple(known[away.argmin(axis=1)].T)]
     return nearest
 
 

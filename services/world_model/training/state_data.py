@@ -1,9 +1,4 @@
-"""Episodes that a state model is trained and evaluated on, and their provenance.
-
-Poses of their objects are those of the twin, of markers or trackers, clicked in the first image, or
-given by touch (docs/objects.md). Where others of their task have poses, episodes without teach
-touch and outcome.
-"""
+"""Episodes that a state model is trained and evaluated on, and their provenance."""
 
 import hashlib
 from collections import Counter
@@ -37,7 +32,7 @@ from dextouch.episodes import (
 from dextouch.errors import InvalidInputError, NotFoundError
 from dextouch.geometry import invert, pose_from_transform, transform, transform_from_pose
 from dextouch.geometry.rotations import rotation_angle
-from dextouch.schemas import Domain, ObjectClicks, SceneObjects, load_object_clicks
+from dextouch.schemas import Domain, ObjectClicks, SceneObjects
 from dextouch.tactile.layout import DEXTOUCH_V1, common_layout
 from services.world_model.checkpoints import learned_tasks
 from services.world_model.dynamics.features import DynamicsConfig
@@ -55,10 +50,7 @@ _NEEDED: Final = (needs.EVERY_PART, needs.WHOLE, needs.OUTCOME, needs.TOUCH, nee
 
 
 class SceneGrid(EpisodeGrid):
-    """An episode on the model grid whose objects a file may list, and people may have clicked.
-
-    `objects` are its task's in a file that lists them, `clicked` poses at the first step.
-    """
+    """An episode whose objects a file may list, and people may have clicked at the first step."""
 
     def __init__(
         self,
@@ -163,8 +155,9 @@ def load_scene_episodes(
 ) -> list[SceneGrid]:
     """Episodes of stores that a state model can learn from, store by store.
 
-    All tasks, all splits, and people and robots, unless some are named. The middle square of images
-    that are larger than `image_px` is scaled to it. Clicks in the stores are used beside `clicks`.
+    The middle square of images larger than `image_px` is scaled to it. Clicks in the stores are
+    used beside `clicks`. Where others of their task have poses, episodes without teach touch and
+    outcome.
 
     Raises:
         NotFoundError, ConflictError: as `select_episodes`.
@@ -229,10 +222,7 @@ def _grid(
 
 @dataclass(frozen=True)
 class StateData:
-    """Episodes of training, of robots and people, and held-out ones.
-
-    Of data of both domains, those of robots alone are held out: rollouts are of robots.
-    """
+    """Episodes of training, and held-out ones: of robots alone if there are both domains."""
 
     training: Sequence[EpisodeGrid]
     heldout: Sequence[EpisodeGrid]
@@ -242,28 +232,22 @@ class StateData:
         """All of them."""
         return [*self.training, *self.heldout]
 
-    @property
-    def has_both_domains(self) -> bool:
-        """Whether people and robots act in the episodes of training."""
-        return len({episode.domain for episode in self.training}) > 1
-
 
 def load_state_data(settings: StateTrainSettings) -> StateData:
-    """Read the episodes of a run.
-
-    Robot episodes are split before a subset of them is taken, so that every subset has the same
-    held-out episodes.
+    """Read the episodes of a run; the held-out ones are the same for all subsets.
 
     Raises:
         NotFoundError: an empty store, none that can be used, or clicks on an unknown episode.
-        ConflictError: an id is in two stores, two episodes are of one recording, or model rates
-            differ.
+        ConflictError: an id in two stores, two episodes of one recording, or several model rates.
         InvalidInputError: held-out scenes that are trained on, or too few episodes.
     """
-    clicks = None if settings.clicks is None else load_object_clicks(settings.clicks)
+    clicks = None if settings.clicks is None else ObjectClicks.load(settings.clicks)
     heldout_urls = () if settings.heldout is None else (settings.heldout,)
     urls = (*settings.episodes, *settings.human, *heldout_urls)
-    _check_clicked(clicks, urls)
+    stores = [EpisodeStore(url) for url in urls]
+    for name in () if clicks is None else clicks.episodes:
+        if not any(store.exists(name) for store in stores):
+            raise NotFoundError(f"clicks: episode {name!r} is in none of {', '.join(urls)}")
     load = partial(
         load_scene_episodes, tasks=settings.tasks, image_px=settings.image_px, clicks=clicks
     )
@@ -276,7 +260,11 @@ def load_state_data(settings: StateTrainSettings) -> StateData:
     training = subset_by_hash(training, settings.robot_episodes, what="robot")
     if settings.human and settings.human_episodes != 0:
         people = load(*settings.human, splits=settings.splits, domain="human")
-        people = _elsewhere(people, heldout)
+        scenes, num_people = {episode.scene for episode in heldout}, len(people)
+        people = [episode for episode in people if episode.scene not in scenes]
+        if len(people) < num_people:
+            reason = "people in scenes that are held out of the robots'"
+            logger.warning("skipped_episodes", reason=reason, count=num_people - len(people))
         training += subset_by_hash(people, settings.human_episodes, what="human")
     if len({episode.domain for episode in training}) > 1:
         heldout = [episode for episode in heldout if episode.domain == "robot"]
@@ -286,16 +274,20 @@ def load_state_data(settings: StateTrainSettings) -> StateData:
                 "--heldout store, or a larger --heldout-share"
             )
     data = StateData(training, heldout)
-    _check_together(data, urls)
+    both = {one.scene for one in data.training} & {one.scene for one in data.heldout}
+    if both:
+        raise InvalidInputError(
+            f"training: scenes {sorted(both)[:3]} are trained on and held out, expected disjoint "
+            "ones; use another --heldout store"
+        )
+    ids = [episode.episode_id for episode in data.episodes]
+    check_stores(urls, ids, {episode.about.model_rate_hz for episode in data.episodes})
     _correct_grips(data.episodes)
     return data
 
 
 def _correct_grips(episodes: Sequence[EpisodeGrid]) -> None:
-    """Correct poses from touch by the takes of a task that have clicks, too, for each domain.
-
-    What a grip is stated to be is off by much the same in all takes.
-    """
+    """Correct poses from touch by takes of the task and domain with clicks: grips are off alike."""
     groups: dict[tuple[str, str, tuple[str, ...]], list[SceneGrid]] = {}
     for one in episodes:
         if isinstance(one, SceneGrid):
@@ -308,8 +300,8 @@ def _correct_grips(episodes: Sequence[EpisodeGrid]) -> None:
             own = Ts[known[:, index], index]
             R, shift_m = own[:, :3, :3], np.median(own[:, :3, 3], axis=0)
             # The turn that is nearest to all others; a mean of turns far apart is none of them.
-            apart_rad = rotation_angle(np.swapaxes(R, 1, 2)[:, None] @ R)
-            turn = R[apart_rad.sum(axis=1).argmin()]
+            distances_rad = rotation_angle(np.swapaxes(R, 1, 2)[:, None] @ R)
+            turn = R[distances_rad.sum(axis=1).argmin()]
             corrections[index] = transform(turn, shift_m)
             shift_mm = 1e3 * float(np.linalg.norm(shift_m))
             turn_deg = float(np.rad2deg(rotation_angle(turn)))
@@ -322,33 +314,8 @@ def _correct_grips(episodes: Sequence[EpisodeGrid]) -> None:
             one.correct_grips(corrections)
 
 
-def _elsewhere(people: list[SceneGrid], heldout: Sequence[EpisodeGrid]) -> list[SceneGrid]:
-    scenes = {episode.scene for episode in heldout}
-    kept = [episode for episode in people if episode.scene not in scenes]
-    if len(kept) < len(people):
-        reason = "people in scenes that are held out of the robots'"
-        logger.warning("skipped_episodes", reason=reason, count=len(people) - len(kept))
-    return kept
-
-
-def _check_together(data: StateData, urls: Sequence[str]) -> None:
-    """Check what holds for all stores of a run; each is read for itself."""
-    both = {one.scene for one in data.training} & {one.scene for one in data.heldout}
-    if both:
-        raise InvalidInputError(
-            f"training: scenes {sorted(both)[:3]} are trained on and held out, expected disjoint "
-            "ones; use another --heldout store"
-        )
-    ids = [episode.episode_id for episode in data.episodes]
-    check_stores(urls, ids, {episode.about.model_rate_hz for episode in data.episodes})
-
-
 def check_new(data: StateData, settings: StateTrainSettings, base: Base | None) -> None:
-    """Check tasks by domain, and that the initial checkpoint has not seen what is held out.
-
-    Raises:
-        InvalidInputError: it has, or as `check_tasks`.
-    """
+    """Check tasks as `check_tasks`; what is held out, the initial checkpoint has not seen."""
     if base is None:
         check_tasks(data.episodes, settings)
         return
@@ -367,24 +334,17 @@ def check_new(data: StateData, settings: StateTrainSettings, base: Base | None) 
         )
 
 
-def _check_clicked(clicks: ObjectClicks | None, urls: Sequence[str]) -> None:
-    stores = [EpisodeStore(url) for url in urls]
-    for name in () if clicks is None else clicks.episodes:
-        if not any(store.exists(name) for store in stores):
-            raise NotFoundError(f"clicks: episode {name!r} is in none of {', '.join(urls)}")
-
-
 def configured(
     data: StateData, settings: StateTrainSettings, base: Base | None = None
 ) -> DynamicsConfig:
     """The configuration of a model of some episodes, which may start from another model.
 
     Raises:
-        InvalidInputError: images of several sizes, tasks whose episodes differ in their objects, or
-            that no episode of training has.
+        InvalidInputError: several image sizes or lists of objects, or tasks that are not trained.
     """
     episodes = data.episodes
     tasks, num_objects = vocabulary(episodes)
+    domains = {episode.domain for episode in data.training}
     untrained = set(tasks) - {episode.task for episode in data.training}
     if untrained:
         raise InvalidInputError(
@@ -403,7 +363,7 @@ def configured(
         num_objects=num_objects,
         image_px=sides.pop(),
         width=settings.width,
-        domains=("robot", "human") if data.has_both_domains else ("robot",),
+        domains=("robot", "human") if len(domains) > 1 else ("robot",),
         instructions=_instructions(episodes, settings, base),
         touch_channels=min(usual, layout.num_taxels),
         layout=None if layout == DEXTOUCH_V1 else layout,
@@ -413,11 +373,7 @@ def configured(
 def _instructions(
     episodes: Sequence[EpisodeGrid], settings: StateTrainSettings, base: Base | None
 ) -> tuple[str, ...]:
-    """The sentences that cores learn to read; none if they read no instruction.
-
-    They do if some episodes have the same objects and another sentence: elsewhere the scene says
-    what is to be done.
-    """
+    """Sentences that cores read: none if each set of objects has but one, as the scene says it."""
     sentences = {one.about.instruction for one in episodes}
     base_reads = base is not None and bool(base.checkpoint.metadata.dynamics.instructions)
     scenes = {(one.object_names, one.about.instruction) for one in episodes}
@@ -436,11 +392,7 @@ def drawn_episodes(data: StateData) -> Sequence[EpisodeGrid]:
 
 
 def check_drawable(episodes: Sequence[EpisodeGrid]) -> None:
-    """Refuse what no renderer can be trained on, before hours of training other parts.
-
-    Raises:
-        InvalidInputError: no episode shows its objects at two known poses.
-    """
+    """Raise InvalidInputError, hours early, if no episode shows its objects at two known poses."""
     for one in episodes:
         if one.objects is not None and one.objects.known[one.image_steps].all(axis=1).sum() > 1:
             return
@@ -458,9 +410,7 @@ def has_poses(episode: EpisodeGrid) -> bool:
 
 
 def labelled_episodes(episodes: Sequence[EpisodeGrid], settings: StateTrainSettings) -> list[bool]:
-    """Mask of episodes whose object poses are trained on.
-
-    Of a scene, these are all takes that have poses, or none.
+    """Mask of episodes whose object poses are trained on: of a scene all takes with poses, or none.
 
     Raises:
         InvalidInputError: a task has none.

@@ -1,8 +1,4 @@
-"""Training of a state model: trains, evaluates and writes an ensemble from episode stores.
-
-Members are trained in separate processes and stored when they are finished, so that an interrupted
-run resumes with the missing ones.
-"""
+"""Training of a state model, whose parts are trained in processes, and stored to be resumed."""
 
 import hashlib
 import time
@@ -34,11 +30,12 @@ from services.world_model.dynamics.core import RecurrentCore
 from services.world_model.dynamics.features import STEPS_PER_LATENT, DynamicsConfig, TouchCodec
 from services.world_model.dynamics.model import DynamicsModel
 from services.world_model.dynamics.start_reader import Reading, StartReader
-from services.world_model.rendering.network import RendererNetwork, uses_bfloat16
+from services.world_model.rendering.renderer import RendererNetwork, uses_bfloat16
 from services.world_model.rendering.training import train_renderer
 from services.world_model.settings import StateAdaptSettings, StateTrainSettings, recorded_command
 from services.world_model.training import core_training, state_data
 from services.world_model.training.episode_sets import training_sets
+from services.world_model.training.evaluation import evaluate_dynamics
 from services.world_model.training.reader_training import OnStep, read_step, train_reader
 from services.world_model.training.scene_table import (
     SceneTable,
@@ -46,7 +43,6 @@ from services.world_model.training.scene_table import (
     scene_table,
     usual_boxes_m,
 )
-from services.world_model.training.state_evaluation import evaluate_dynamics
 from services.world_model.training.transfer import Base
 
 # Increment when a change of training gives other weights for the same settings and data.
@@ -380,7 +376,12 @@ def _train_core(work: _Work, member: int) -> None:
     table, codec = _table(work)
     started_s = time.process_time()
     if work.reads_starts or work.keeps_readers:
-        reader = _finished_reader(work, member)
+        if work.base is not None and work.keeps_readers:
+            reader = work.base.checkpoint.dynamics.readers()[member]
+        else:
+            reader = StartReader(work.config)
+            _load(reader, work.reader_file(member))
+        reader.eval()
         readings = {
             step: read_step(reader, table, step) for step in core_training.start_steps(table)
         }
@@ -397,14 +398,6 @@ def _train_core(work: _Work, member: int) -> None:
         data, work.config, work.settings.core, seed=seed, on_step=on_step, initial=initial
     )
     _keep(core, work.core_file(member), time.process_time() - started_s)
-
-
-def _finished_reader(work: _Work, member: int) -> StartReader:
-    if work.base is not None and work.keeps_readers:
-        return work.base.checkpoint.dynamics.readers()[member].eval()
-    reader = StartReader(work.config)
-    _load(reader, work.reader_file(member))
-    return reader.eval()
 
 
 def _on_step(member: int, part: str) -> OnStep:

@@ -43,10 +43,7 @@ _Side = dict[str, list[tuple[np.ndarray, str]]]
 
 @dataclass(frozen=True)
 class TactileHands:
-    """Measured touch of the hands of some scenes, at the model rate.
-
-    `data_hash` is that of their episodes.
-    """
+    """Measured touch of hands of some scenes at the model rate, with the hash of their episodes."""
 
     tactile_kpa: Float32[np.ndarray, "hands taxels"]
     scenes: tuple[str, ...]
@@ -58,9 +55,6 @@ def load_hands(
     urls: Sequence[str], *, splits: Collection[Split] = (), heldout_share: float
 ) -> tuple[TactileHands, TactileHands]:
     """Training and held-out hands of all people and robots; a scene is on one side only.
-
-    Hands of steps without a measurement and imagined episodes are left out; single taxels that were
-    not measured are filled.
 
     Raises:
         InvalidInputError: either side has no scene, or the episodes are of several gloves.
@@ -104,8 +98,6 @@ def train_tokenizer(
     settings: TrainTokenizerSettings, on_evaluation: OnEvaluation | None = None
 ) -> TokenizerReport:
     """Train a tokenizer, evaluate it on held-out scenes and write it.
-
-    `on_evaluation` is called with the completed share and each new point of the curve.
 
     Raises:
         InvalidInputError: no scene to train on or none held out, or no touch at all.
@@ -202,11 +194,7 @@ def reconstruction_loss(
     *,
     contact_weight: float,
 ) -> Float32[Tensor, ""]:
-    """Weighted mean squared error of root pressures (kPa).
-
-    Taxels in contact have the weight `contact_weight`, the others, which are many more, 1. Roots
-    weight light touch like strong touch.
-    """
+    """Mean squared error of root pressures (√kPa), `contact_weight` times in contact."""
     error = tokenizer.roots(tokenizer.encode(tactile_kpa)) - root_pressure(tactile_kpa)
     weights = torch.where(tactile_kpa >= CONTACT_THRESHOLD_KPA, contact_weight, 1.0)
     return (weights * error.square()).sum() / weights.sum()
@@ -254,8 +242,7 @@ def with_tokenizer(
     """The settings with the network of `--tokenizer`, and that tokenizer if one is given.
 
     Raises:
-        InvalidInputError: a learned tokenizer without a file or an initial checkpoint that holds
-            it, both of these, or a tokenizer for a network without touch.
+        InvalidInputError: a learned tokenizer of no file, or --tokenizer with --init or no touch.
         ConflictError: the network settings name another tokenizer than the file.
     """
     if settings.tokenizer is None:
@@ -282,11 +269,7 @@ def with_tokenizer(
 def split_unseen(
     episodes: Sequence[E], stored: checkpoints.StoredTokenizer, *, heldout_percent: int
 ) -> tuple[list[E], list[E]]:
-    """Training and held-out episodes, the latter of scenes that the tokenizer has not seen.
-
-    Raises:
-        InvalidInputError: either side would be empty.
-    """
+    """Training and held-out episodes, of scenes that the tokenizer has not seen; none empty."""
     sizes = Counter(episode.scene for episode in episodes)
     heldout: set[str] = set()
     for scene in sorted(sizes.keys() - set(stored.metadata.train_scenes), key=scene_fraction):

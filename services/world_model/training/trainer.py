@@ -23,9 +23,8 @@ from services.networks.weight_files import on_device
 from services.world_model import checkpoints
 from services.world_model.network.codecs import to_unit
 from services.world_model.network.configuration import NetworkConfig, WanFiles, num_latents
-from services.world_model.network.inputs import build_inputs
+from services.world_model.network.inputs import PastRule, build_inputs
 from services.world_model.network.model import JointWorldModel, from_first
-from services.world_model.network.past import PastRule
 from services.world_model.network.tactile import TactileTokenizer
 from services.world_model.paper_settings import TrainSettings, command_line
 from services.world_model.pretrained_video import (
@@ -36,7 +35,7 @@ from services.world_model.pretrained_video import (
 )
 from services.world_model.training import dataset, episode_sets, tokenizer_trainer, training_state
 from services.world_model.training.distribution import ALONE, Processes, load_whole, whole_weights
-from services.world_model.training.episode_split import check_disjoint, load_split
+from services.world_model.training.episode_sets import check_disjoint, load_split
 from services.world_model.training.evaluation import evaluate_prediction, refuse_trained
 from services.world_model.training.objective import (
     LossOptions,
@@ -65,8 +64,7 @@ OnState = Callable[["TrainingRun"], None]
 class TrainingRun:
     """One run: network, averages of its learned weights, optimizer and clock.
 
-    Windows depend on the seed only, not on whether they are cut in memory or streamed from disk.
-    Averages that would equal the weights (`ema_decay` 0) are not kept.
+    Windows depend on the seed only. Averages that would equal the weights are not kept.
     """
 
     def __init__(
@@ -129,10 +127,7 @@ class TrainingRun:
 
     @torch.no_grad()
     def fit_codecs(self, tokenizer: TactileTokenizer | None = None) -> None:
-        """Fit everything in closed form: codecs, action statistics, residual scales.
-
-        A pretrained tokenizer is taken instead of fitting one.
-        """
+        """Fit codecs, unless a tokenizer is given, action statistics and residual scales."""
         model, config = self.model, self.settings.network
         fitted = [model.tokenizer, model.normalizer, *([] if config.wan else [model.codec])]
         for part in fitted:
@@ -156,9 +151,7 @@ class TrainingRun:
             part.to(model.device)
 
     def start_from(self, checkpoint: checkpoints.Checkpoint) -> None:
-        """Take over the weights and codecs of a checkpoint.
-
-        Its adapters are merged, unless the run has as large ones.
+        """Take over the weights and codecs of a checkpoint; unequal adapters are merged.
 
         Raises:
             ConflictError: the checkpoint has other network settings; they are named.
@@ -191,10 +184,7 @@ class TrainingRun:
 
     @torch.no_grad()
     def whole_average(self) -> JointWorldModel | None:
-        """The averaged network with whole weights; None in all processes but the first.
-
-        Weights of the run become their averages, and adapters are merged, unless they are kept.
-        """
+        """The averaged network, its adapters merged unless kept; None in other processes."""
         for name, average in self._averages.items():
             self.learned[name].copy_(average)
         model = self.model
@@ -246,11 +236,7 @@ class TrainingRun:
     def run(
         self, on_progress: OnProgress | None = None, on_step: OnState | None = None
     ) -> list[TrainingProgress]:
-        """Train until the budget or the number of steps is used up; returns the loss log.
-
-        `on_progress` is called with every entry of the log, `on_step` with the run after every
-        step.
-        """
+        """Train until a limit; returns the loss log, of which `on_progress` gets each entry."""
         budget = self.budget
         budget.start()
         self.model.train()
@@ -324,20 +310,18 @@ class TrainingRun:
 
     def places(self) -> Iterator[list[dataset.WindowPosition]]:
         """Endless iterator over the places of the windows of each step."""
+        longest, rng = self.settings.network.max_steps, self._rng
         while True:
-            num_steps = self._window_steps(self._num_steps())
-            yield self._sampler.places(self.settings.optimizer.batch, num_steps)
+            num_steps = longest
+            # Sometimes 5, 9, … steps, since short chunks are served, too.
+            if rng.random() < self.settings.windows.short_fraction:
+                num_steps = int(rng.choice(np.arange(5, longest + 1, 4)))
+            batch = self.settings.optimizer.batch
+            yield self._sampler.places(batch, self._window_steps(num_steps))
 
     def _window_steps(self, num_steps: int) -> int:
         """Steps of a window of one chunk, or of two for self-forcing."""
         return 2 * num_steps - 1 if self.settings.self_forcing else num_steps
-
-    def _num_steps(self) -> int:
-        """Mostly the full window; sometimes 5, 9, … steps, since short chunks are served, too."""
-        longest = self.settings.network.max_steps
-        if self._rng.random() >= self.settings.windows.short_fraction:
-            return longest
-        return int(self._rng.choice(np.arange(5, longest + 1, 4)))
 
 
 def _all_views(batch: dataset.WindowBatch) -> UInt8[Tensor, "n time px px 3"]:
@@ -367,9 +351,7 @@ class TrainingReport:
 def train(
     settings: TrainSettings, on_progress: OnProgress | None = None, processes: Processes = ALONE
 ) -> TrainingReport | None:
-    """Load episodes, train, write and evaluate the checkpoint.
-
-    Only the first of several processes writes, evaluates and reports; the others return None.
+    """Load episodes, train, write and evaluate the checkpoint; None but in the first process.
 
     Raises:
         InvalidInputError: no episodes, too short ones, or held-out ones among those trained on.
@@ -388,9 +370,13 @@ def train_on(
     """`train` with episodes that are already split."""
     check_disjoint(trained, heldout)
     settings, tokenizer = tokenizer_trainer.with_tokenizer(settings)
-    settings = _with_layout(settings.with_adapters(), (*trained, *heldout), tokenizer)
+    settings, layouts = settings.with_adapters(), [e.tactile_layout for e in (*trained, *heldout)]
+    layout = common_layout(layouts, what="training episodes")
     if tokenizer is not None:
+        known = settings.network.tactile_layout
+        common_layout([known, layout], what="--tokenizer and the training episodes")
         tokenizer_trainer.check_unseen(heldout, tokenizer)
+    settings = settings.model_copy(update={"network": settings.network.with_layout(layout)})
     torch.set_num_threads(settings.num_threads)
     ancestor = None if settings.init is None else checkpoints.read_checkpoint(settings.init)
     known_tasks: set[str] = set()
@@ -483,24 +469,6 @@ def _metadata(
         action_dropout=dropped[1],
         view_dropout=windows.view_dropout if network.further_views else 0.0,
     )
-
-
-def _with_layout(
-    settings: TrainSettings,
-    episodes: Sequence[dataset.TrainingEpisode],
-    tokenizer: checkpoints.StoredTokenizer | None,
-) -> TrainSettings:
-    """The settings with a network for the taxels of all episodes.
-
-    Raises:
-        InvalidInputError: episodes of several gloves, or a tokenizer of another one.
-    """
-    layout = common_layout([one.tactile_layout for one in episodes], what="training episodes")
-    if tokenizer is not None:
-        known = settings.network.tactile_layout
-        common_layout([known, layout], what="--tokenizer and the training episodes")
-    network = settings.network.with_layout(layout)
-    return settings.model_copy(update={"network": network})
 
 
 def _data_hash(

@@ -1,9 +1,8 @@
 """State of a training run, saved beside its output so that an interrupted run can resume.
 
-It is one safetensors file of the weights, their moving average, the optimizer and the random state,
-with the counters as JSON in its metadata. Under torchrun it is a folder with a folder for each
-state, with a file of every process; the counters, in a JSON file beside them, name the newest
-complete one, and any number of processes can resume. A crash leaves the last complete state.
+It is one safetensors file, with the counters as JSON in its metadata. Under torchrun it is a folder
+of folders with a file of every process; the counters, in a JSON file beside them, name the newest
+complete one. A crash leaves the last complete state.
 """
 
 import json
@@ -45,11 +44,7 @@ _FREE_SETTINGS: Final = {
 
 
 class RunFacts(FrozenModel):
-    """Metadata of a state.
-
-    `identity` holds the settings and data of the run, `window_numbers` the state of the generator
-    of windows, as JSON. `log` has rows of step, completed fraction, and video and tactile losses.
-    """
+    """Counters of a state, and the settings and data of its run; `log` as `TrainingProgress`."""
 
     identity: dict[str, JsonValue]
     step: int
@@ -63,8 +58,8 @@ class RunFacts(FrozenModel):
 class TrainingState:
     """Everything that the next steps of a run depend on.
 
-    Tensor names begin with `model.`, `averaged.` or `optimizer.` (followed by the name of a moment
-    and that of its weight), or are `generator`. Pretrained weights that are not trained are absent.
+    Tensor names begin with `model.`, `averaged.` or `optimizer.` (then moment and weight), or are
+    `generator`. Pretrained weights that are not trained are absent.
     """
 
     tensors: dict[str, Tensor]
@@ -81,11 +76,7 @@ class StateFiles:
         self._is_sharded = processes.mesh is not None
 
     def exists(self) -> bool:
-        """Whether there is a state to resume.
-
-        Raises:
-            ConflictError: there is only one of a run that was started otherwise.
-        """
+        """Whether there is a state to resume; ConflictError if only of a run started otherwise."""
         single, sharded = self._file.is_file(), (self._folder / FACTS).is_file()
         own, other = (sharded, single) if self._is_sharded else (single, sharded)
         if other and not own:
@@ -97,10 +88,7 @@ class StateFiles:
         return own
 
     def read(self, identity: Mapping[str, JsonValue], own: Mapping[str, Tensor]) -> TrainingState:
-        """Read the state of a run with these settings and data.
-
-        `own` has a tensor of the same name, shape and sharding for every tensor of the state. Of a
-        sharded state, those of the model are loaded in place.
+        """Read the state of a run, with tensors as of `own`; sharded weights are loaded in place.
 
         Raises:
             ConflictError: the state has other settings or data; they are named.

@@ -21,19 +21,13 @@ _SUCCESS = "success."
 
 
 class Base:
-    """A trained state model that another one starts from.
-
-    Raises:
-        NotFoundError, CorruptDataError, InvalidInputError: as `read_state_checkpoint`.
-    """
+    """A state model that another one starts from; raises as `read_state_checkpoint`."""
 
     def __init__(self, path: Path) -> None:
         self._path, self.checkpoint = path, read_state_checkpoint(path)
 
     def configured(self, config: DynamicsConfig, *, keeps_tasks: bool) -> DynamicsConfig:
-        """A configuration with the shape of the base's networks, for the tasks of another one.
-
-        With `keeps_tasks`, they stay the base's, of which the episodes have some.
+        """A configuration with the shape of the base's networks, for another's tasks, or its own.
 
         Raises:
             InvalidInputError: images of another size, or another glove.
@@ -93,10 +87,9 @@ class Base:
     def core(
         self, config: DynamicsConfig, member: int, *, seed: int, learns_all: bool
     ) -> RecurrentCore:
-        """A member's core, in which only fresh weights that predict success can be trained, or all.
+        """A member's core, in which all can be trained, or only fresh weights that predict success.
 
-        Of new tasks, they see distances, heights and angles of predicted poses alone: a few takes
-        do not suffice to find which directions, or which units of the hidden state, do not matter.
+        Of new tasks, these see distances, heights and angles alone, for want of takes.
         """
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
@@ -129,10 +122,7 @@ class Base:
 def _with_new_inputs(
     kept: dict[str, Tensor], own: DynamicsConfig, core: RecurrentCore
 ) -> dict[str, Tensor]:
-    """Weights of a core for one that also tells people from robots, or reads an instruction.
-
-    The new inputs, the last ones, have no effect at first, and people feel as robots do.
-    """
+    """Weights for a core with new inputs (people, an instruction), without effect at first."""
     shapes = {name: value.shape for name, value in core.named_parameters()}
     known = dict(kept)
     new_sentence = core.config.instruction_size - own.instruction_size

@@ -1,8 +1,4 @@
-"""Recordings made of the streams of other tools' files, with their provenance and a report.
-
-Readers of a format yield streams in blocks; what they cannot read they refuse by name. The names of
-streams follow one rule for all formats (`stream_names`).
-"""
+"""Recordings made of the streams of other tools' files, with their provenance and a report."""
 
 import hashlib
 import re
@@ -81,6 +77,16 @@ class ImportedStream:
     num_repeated_stamps: int = 0
     num_device_stamps: int = 0
     notes: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, about: StreamDescriptor, source: str) -> "ImportedStream":
+        """A stream of which nothing was written yet."""
+        return cls(about.name, source, about.kind, about.unit, about.shape, about.frame)
+
+    def set_span(self, first_ns: int, last_ns: int) -> None:
+        """Duration and mean rate of all samples, by their first and last stamp."""
+        self.duration_s = (last_ns - first_ns) / _NS_PER_S
+        self.rate_hz = (self.num_samples - 1) / self.duration_s if self.duration_s else 0.0
 
 
 @dataclass
@@ -343,13 +349,10 @@ class _Counter:
     """Appends the blocks of one stream, and counts what is unusual in them."""
 
     def __init__(self, stream: ForeignStream, writer: EpisodeWriter) -> None:
-        about, self._writer = stream.descriptor, writer
+        self._writer, self._notes = writer, stream.notes
         self._first_ns: int | None = None
         self._last_ns = 0
-        self.report = ImportedStream(
-            about.name, stream.source, about.kind, about.unit, about.shape, about.frame
-        )
-        self._notes = stream.notes
+        self.report = ImportedStream.of(stream.descriptor, stream.source)
 
     def append(self, block: Block) -> None:
         if not len(block):
@@ -378,11 +381,7 @@ class _Counter:
         self.report.num_device_stamps += int((block.t_device_ns != NO_DEVICE_TIME).sum())
 
     def result(self) -> ImportedStream:
-        """The counts, with duration and rate."""
-        one = self.report
-        one.notes = tuple(self._notes)
-        one.duration_s = (
-            (self._last_ns - (self._first_ns or 0)) / _NS_PER_S if one.num_samples else 0.0
-        )
-        one.rate_hz = (one.num_samples - 1) / one.duration_s if one.duration_s else 0.0
-        return one
+        self.report.notes = tuple(self._notes)
+        if self._first_ns is not None:
+            self.report.set_span(self._first_ns, self._last_ns)
+        return self.report

@@ -105,7 +105,6 @@ class _Readings:
         self._schema_of: dict[str, str] = {}
 
     def run(self) -> Iterator[Reading]:
-        """Iterate over the messages."""
         for record in records(self._path):
             if isinstance(record, Message):
                 if record.channel_id not in self._channels:
@@ -297,11 +296,8 @@ def _plain_ros(message: Any) -> dict[str, Any]:  # noqa: ANN401 - made at run ti
 
 def _plain_value(value: Any) -> Any:  # noqa: ANN401
     if isinstance(value, list):
-        return [_plain_value(one) for one in value] if _has_messages(value) else value
+        has_messages = bool(value) and hasattr(value[0], "__slots__")
+        return [_plain_value(one) for one in value] if has_messages else value
     if isinstance(value, bytes):
         return np.frombuffer(value, dtype=np.uint8)
     return _plain_ros(value) if hasattr(value, "__slots__") else value
-
-
-def _has_messages(values: list[Any]) -> bool:
-    return bool(values) and hasattr(values[0], "__slots__")

@@ -496,7 +496,8 @@ def _flat(message: Plain) -> Item:
             paths.append((path, value.size if value.ndim else -1))
             numbers.append(value.ravel().astype(np.float64))
             size += value.size
-            if value.dtype.kind in "iu" and value.size and _is_rounded(value):
+            is_whole = value.dtype.kind in "iu" and value.size
+            if is_whole and max(-int(value.min()), int(value.max())) > _MAX_EXACT:
                 rounded.append(path)
         elif value not in {None, ""} and path not in {"frame_id", "header.frame_id"}:
             skipped.append(path)
@@ -516,10 +517,6 @@ def _flat(message: Plain) -> Item:
         notes=tuple(f"{what}: {', '.join(which[:8])}" for what, which in said.items() if which),
     )
     return _array_item(message, form, np.concatenate(numbers))
-
-
-def _is_rounded(values: np.ndarray) -> bool:
-    return int(values.max()) > _MAX_EXACT or int(values.min()) < -_MAX_EXACT
 
 
 @lru_cache(maxsize=64)

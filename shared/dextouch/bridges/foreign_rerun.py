@@ -166,7 +166,6 @@ class _Rows:
         self._latest = _Latest()
 
     def run(self) -> Iterator[Reading]:
-        """Iterate over the rows."""
         self._note_file()
         for chunk in _chunks(self._path):
             if chunk.is_static:
@@ -175,8 +174,8 @@ class _Rows:
             elif self._timeline in chunk.timeline_names:
                 self._latest.find_gaps(chunk)
         for entity, known in self._latest.static.items():
-            if (model := _pinhole(known)) is not None:
-                self._note_camera(entity, model)
+            if self._survey is not None and (model := _pinhole(known)) is not None:
+                self._survey.note_camera(entity, model)
         if self._latest.has_gaps():
             self._latest.add_all(_chunks(self._path), self._timeline)
         for chunk in _chunks(self._path):
@@ -200,10 +199,6 @@ class _Rows:
         if names:
             reason = f"static ({', '.join(names)[:200]}), so without a time"
             self._survey.refuse(chunk.entity_path, "static", reason)
-
-    def _note_camera(self, entity: str, model: CameraModel) -> None:
-        if self._survey is not None:
-            self._survey.note_camera(entity, model)
 
     def _rows(self, chunk: Chunk) -> Iterator[Reading]:
         entity, batch = chunk.entity_path, chunk.to_record_batch()
@@ -248,7 +243,8 @@ class _Rows:
         model = _pinhole(known)
         if model is None:
             raise InvalidInputError("pinhole without a matrix and a resolution")
-        self._note_camera(entity, model)
+        if self._survey is not None:
+            self._survey.note_camera(entity, model)
         left_out = "" if "Pinhole:camera_xyz" not in known else "left out: camera_xyz"
         return Reading(entity, "Pinhole", t_ns, reason=left_out)
 
@@ -264,7 +260,6 @@ class _Latest:
         self.static: dict[str, dict[str, Any]] = {}
         self._patterns: dict[tuple[str, str], set[frozenset[str]]] = {}
         self._history: dict[tuple[str, str], list[tuple[int, Any]]] = {}
-        self._moments: dict[tuple[str, str], list[int]] = {}
         self._num_values = 0
 
     def add_static(self, chunk: Chunk) -> None:
@@ -277,7 +272,6 @@ class _Latest:
                     known[name] = _plain(value)
 
     def find_gaps(self, chunk: Chunk) -> None:
-        """Note which components the rows of a chunk have."""
         batch = chunk.to_record_batch()
         by_archetype: dict[str, list[str]] = {}
         for name in _components(batch):
@@ -301,9 +295,8 @@ class _Latest:
         for chunk in chunks:
             if not chunk.is_static and timeline in chunk.timeline_names:
                 self._add(chunk, timeline)
-        for key, found in self._history.items():
+        for found in self._history.values():
             found.sort(key=itemgetter(0))
-            self._moments[key] = [moment for moment, _ in found]
 
     def _add(self, chunk: Chunk, timeline: str) -> None:
         entity, batch = chunk.entity_path, chunk.to_record_batch()
@@ -328,10 +321,10 @@ class _Latest:
         for name in _COMPLETED_OF.get(archetype, ()):
             if name in row:
                 found[name] = _plain(row[name])
-            elif moments := self._moments.get((entity, name)):
-                index = bisect_right(moments, moment)
+            elif history := self._history.get((entity, name)):
+                index = bisect_right(history, moment, key=itemgetter(0))
                 if index:
-                    found[name] = self._history[entity, name][index - 1][1]
+                    found[name] = history[index - 1][1]
         return found
 
 

@@ -1,8 +1,4 @@
-"""Streams found among the samples of a foreign file, in two passes over it.
-
-The first pass finds the streams, their rates and shapes, and what does not fit; the second one
-writes. Readers of formats only say what samples a record has.
-"""
+"""Streams found among the samples of a foreign file, in two passes over it."""
 
 import math
 import re
@@ -26,12 +22,9 @@ from dextouch.bridges.foreign import (
     stream_names,
     write_recording,
 )
-from dextouch.bridges.foreign_images import check_pixels
+from dextouch.bridges.foreign_images import Losses, Video, VideoDecoder, check_pixels
 from dextouch.bridges.foreign_messages import GROUP, VIDEO_UNIT, CameraModel, Form, Item
-from dextouch.bridges.foreign_video import Losses, Video, VideoDecoder
-from dextouch.episodes import (
-    EpisodeStore,
-)
+from dextouch.episodes import EpisodeStore
 from dextouch.errors import (
     CorruptDataError,
     DexTouchError,
@@ -47,7 +40,6 @@ from dextouch.streams import (
     MAX_STREAMS,
     NO_DEVICE_TIME,
     TAXEL_UNIT,
-    ClockCapabilities,
     StreamDescriptor,
     encoded_values,
 )
@@ -63,6 +55,7 @@ MAX_PENDING_BYTES: Final = 1 << 22
 MAX_PENDING: Final = 4096
 MIN_RATE_HZ, MAX_RATE_HZ = 1e-6, 10_000.0
 _MAX_REASONS = 8
+_NO_IMAGE: Final = "packet without an image (before a key frame, or damaged)"
 _SIDES = ("left", "right")
 # Names of rectified images, as image_proc of ROS has them: image_rect, image_rect_color.
 _RECTIFIED: Final = re.compile(r"(^|[/_])rect(ified)?([/_]|$)")
@@ -103,10 +96,8 @@ def mapped_form(
         is_float = form.dtype.startswith("float")
         count = layout.num_taxels if is_float else layout.num_raw_cells
         what = "taxels in kPa" if is_float else "raw cells"
-        wanted, fits = (
-            f"the {count} {what} of {layout.name!r} (--layout)",
-            numbers and size == count,
-        )
+        wanted = f"the {count} {what} of {layout.name!r} (--layout)"
+        fits = numbers and size == count
         made = replace(
             form,
             kind="tactile",
@@ -116,10 +107,8 @@ def mapped_form(
         )
     elif name.startswith("keypoints_") and side:
         rows = form.shape[0] if len(form.shape) == 2 else size // 3
-        wanted, fits = (
-            "points [n, 3] or poses [n, 7]",
-            numbers and ((len(form.shape) == 2 and form.shape[1] >= 3) or size == 3 * rows),
-        )
+        wanted = "points [n, 3] or poses [n, 7]"
+        fits = numbers and ((len(form.shape) == 2 and form.shape[1] >= 3) or size == 3 * rows)
         made = replace(form, kind="keypoints", unit="m", dtype="float64", shape=(rows, 3))
     elif name.startswith("wrist_") or name == "head":
         wanted, fits, made = "poses of one body", form.kind == "pose" and form.shape == (7,), form
@@ -221,7 +210,7 @@ class _Part:
         layout = about.layout or DEXTOUCH_V1
         form, self._convert, side = mapped_form(name, form, layout)
         self.form, self.name = form, name
-        shown = form.names if form.shape[-1:] == (len(form.names),) else ()
+        names = form.names if form.shape[-1:] == (len(form.names),) else ()
         try:
             return StreamDescriptor.model_validate(
                 {
@@ -233,9 +222,11 @@ class _Part:
                     "nominal_rate_hz": self._rate_hz(),
                     "frame": form.frame,
                     "side": side,
-                    "names": shown,
+                    "names": names,
                     "layout": about.layout if form.kind == "tactile" else None,
-                    "capabilities": self._capabilities(),
+                    "capabilities": {
+                        "device_time": self.rises and self.num_device == len(self.times)
+                    },
                 }
             )
         except ValidationError as error:
@@ -263,10 +254,6 @@ class _Part:
         rate_hz = 1e9 / float(np.median(steps)) if len(steps) else 1.0
         return min(max(rate_hz, MIN_RATE_HZ), MAX_RATE_HZ)
 
-    def _capabilities(self) -> ClockCapabilities:
-        is_dated = self.rises and self.num_device == len(self.times)
-        return ClockCapabilities(device_time=is_dated)
-
     def misfits(self) -> Iterator[Refused]:
         """Samples of other shapes than the stream's."""
         for form, count in self.forms:
@@ -276,8 +263,7 @@ class _Part:
                 yield self._refused(f"{form.describe()}, {names}and most are {other}", count)
 
     def losses(self) -> Iterator[Refused]:
-        """Samples that could not be decoded."""
-        for reason, count in self.lost.items():
+        for reason, count in (+self.lost).items():
             yield self._refused(reason, count)
 
     def _refused(self, reason: str, count: int) -> Refused:
@@ -308,14 +294,13 @@ class _Part:
             self._stamps.pop(self._num_packets - 1, None)
             if self._losses is not None:
                 self._losses.lose()
-            self.lose(error)
+            self._lose(error)
         if self.is_ordered and (
             self._pending_bytes >= MAX_PENDING_BYTES or len(self._rows) >= MAX_PENDING
         ):
             yield from self.flush()
 
-    def lose(self, error: DexTouchError) -> None:
-        """Count a sample that was lost."""
+    def _lose(self, error: DexTouchError) -> None:
         reason = error.message if len(self.lost) < _MAX_REASONS else "other reasons"
         self.lost[reason] += 1
 
@@ -332,7 +317,7 @@ class _Part:
             # Packets before that gave no image: before the first key frame, or damaged.
             for older in [one for one in self._stamps if one < number]:
                 del self._stamps[older]
-                self.lost["packet without an image (before a key frame, or damaged)"] += 1
+                self.lost[_NO_IMAGE] += 1
             if known is None or (frame.height, frame.width) != self.form.shape[:2]:
                 self.lost["image of another size, or shown in another order than sent"] += 1
             elif not self._losses.is_right(number, is_keyframe=bool(frame.key_frame)):
@@ -348,15 +333,12 @@ class _Part:
         self._pending_bytes += len(value) if isinstance(value, bytes) else value.nbytes
 
     def finish(self) -> Iterator[Block]:
-        """The rest of the samples."""
         if self._decoder is not None:
             try:
                 self._decode_video(None, None)
             except DexTouchError as error:
-                self.lose(error)
-            if self._stamps:
-                reason = "packet without an image (before a key frame, or damaged)"
-                self.lost[reason] += len(self._stamps)
+                self._lose(error)
+            self.lost[_NO_IMAGE] += len(self._stamps)
         yield from self.flush()
 
     def flush(self) -> Iterator[Block]:
@@ -552,7 +534,12 @@ def import_readings(
         UnknownNameError: a mapping of a source that the file does not have.
         ConflictError: the store has a recording of this id.
     """
-    survey = _surveyed(read)
+    survey = Survey()
+    try:
+        for reading in read(survey):
+            survey.observe(reading)
+    except CorruptDataError as error:
+        raise CorruptDataError(f"{error.message}; {survey.summary()}") from error
     refused = survey.refused()
     try:
         planned = _planned(survey, about, refused)
@@ -569,16 +556,6 @@ def import_readings(
     )
     blocks = _blocks(parts, read(None), refused)
     return write_recording(store, attributes, streams, blocks=blocks, refused=refused)
-
-
-def _surveyed(read: Callable[[Survey | None], Iterator[Reading]]) -> Survey:
-    survey = Survey()
-    try:
-        for reading in read(survey):
-            survey.observe(reading)
-    except CorruptDataError as error:
-        raise CorruptDataError(f"{error.message}; {survey.summary()}") from error
-    return survey
 
 
 def _blocks(

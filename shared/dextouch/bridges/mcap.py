@@ -115,11 +115,6 @@ def has_wall_times(about: Attributes) -> bool:
     return wall_offset_ns(about) is not None
 
 
-def touch_image_topic(stream: str) -> str:
-    """Topic of the pictures of a tactile stream."""
-    return f"/{stream}/image"
-
-
 # Log time, order of the channel among equal ones, publish time, counter and bytes of a message.
 _Timed = tuple[int, int, int, int, bytes]
 
@@ -153,7 +148,6 @@ class _Export:
         return stream.model_copy(update={"unit": "jpeg"}) if to_jpeg else stream
 
     def run(self, *, touch_images: bool) -> int:
-        """Write schemas, channels, attachments and messages, in this order."""
         self._writer.start(profile=PROFILE, library=f"dextouch {__version__}")
         self._write_about()
         channels = [self._open_pictures(s) if touch_images else None for s in self._sources]
@@ -261,8 +255,7 @@ class _Export:
         codec, order = MessageCodec(picture), len(self._channel_ids)
         shown = {"unit": stream.unit, "black": "0", "brightest": f"{pictures.full_scale:g}"}
         shown |= {"scale": "square root", "layout": stream.tactile_layout.name}
-        topic = touch_image_topic(stream.name)
-        self._channel_ids.append(self._channel(topic, codec.message, shown))
+        self._channel_ids.append(self._channel(f"/{stream.name}/image", codec.message, shown))
         return _Pictures(pictures, codec, order)
 
     def _messages(self, order: int, pictures: "_Pictures | None") -> Iterator[_Timed]:

@@ -11,14 +11,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 from rerun.components import ImageFormat
 
-from dextouch.bridges.exporting import (
-    Block,
-    Reader,
-    TouchPictures,
-    blocks,
-    new_file,
-    touch_side,
-)
+from dextouch.bridges.exporting import Block, Reader, TouchPictures, blocks, new_file, touch_side
 from dextouch.episodes import EpisodeReader, is_keyframe
 from dextouch.errors import InvalidInputError
 from dextouch.schemas import json_ready
@@ -46,8 +39,8 @@ def export_rrd(reader: Reader, path: Path, *, overwrite: bool = False) -> int:
         stream = rr.RecordingStream(APPLICATION, recording_id=reader.item_id)
         try:
             stream.save(path_partial, default_blueprint=_blueprint(reader))
-            words = json.dumps(json_ready(attributes), indent=2)
-            text = rr.TextDocument(f"```json\n{words}\n```", media_type="text/markdown")
+            attributes_json = json.dumps(json_ready(attributes), indent=2)
+            text = rr.TextDocument(f"```json\n{attributes_json}\n```", media_type="text/markdown")
             stream.log("attributes", text, static=True)
             stream.send_property(
                 "dextouch",

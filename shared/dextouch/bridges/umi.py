@@ -60,7 +60,11 @@ def export_umi(readers: Iterable[EpisodeReader], path: Path, *, overwrite: bool 
         disk_errors(str(path)),
     ):
         num_steps = _write_group(zarr.open_group(folder, mode="w", zarr_format=2), readers)
-        _zip(Path(folder), file)
+        # Its files are compressed already.
+        with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
+            for entry in sorted(path for path in Path(folder).rglob("*") if path.is_file()):
+                about = zipfile.ZipInfo(entry.relative_to(folder).as_posix(), _ZIP_DATE)
+                archive.writestr(about, entry.read_bytes())
     return num_steps
 
 
@@ -113,14 +117,6 @@ def _append(
         chunks=(chunk_rows, *rows.shape[1:]),
         attributes=dict(attributes or {}),
     )
-
-
-def _zip(folder: Path, file: Path) -> None:
-    """Write the files of a folder, which are compressed already, uncompressed and in order."""
-    with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
-        for entry in sorted(path for path in folder.rglob("*") if path.is_file()):
-            about = zipfile.ZipInfo(entry.relative_to(folder).as_posix(), _ZIP_DATE)
-            archive.writestr(about, entry.read_bytes())
 
 
 def _shared(reader: EpisodeReader) -> dict[str, tuple[int, ...]]:

@@ -1,8 +1,4 @@
-"""Clock model that maps device time to host time, fitted offline.
-
-A line across a step is wrong on both sides, so a take is split at the steps and stops of its
-device's clock before fitting, and single wrong stamps are left out.
-"""
+"""Clock model that maps device time to host time, fitted offline between the steps of the clock."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -68,9 +64,9 @@ MAX_END_DELAY_NS = 500e6
 class ClockSegment:
     """Part of a take in which the device's clock ran without a step.
 
-    host = device + reference_offset_ns + (piecewise linear through knots of the offset), where
-    knots are in seconds of device time after `start_device_ns`, extrapolated linearly. It covers
-    arrivals from `start_host_ns` on, except the first `num_tied` with that exact stamp.
+    host = device + reference_offset_ns + (piecewise linear through knots of the offset), knots in
+    seconds after `start_device_ns`. It covers arrivals from `start_host_ns` on, except the first
+    `num_tied` with that exact stamp.
     """
 
     start_device_ns: int
@@ -104,13 +100,10 @@ class ClockModel:
     Attributes:
         segments: in order of arrival; more than one where the device's clock was stepped.
         skew_ppm: how much faster the host's clock runs, mean over all segments.
-        residual_rms_ns: RMS of arrival minus fitted time: queueing on the path, not the error of
-            the fit (which is far smaller).
-        lateness_ns: minimum of arrival minus fitted time within five seconds, the largest of the
-            take, excluding detected delays. Near zero for a good fit, even on paths with queueing,
-            bursts and stalls.
-        has_unsure_stops: whether a stop of the device's clock may have been a delay or a slew, or
-            a delay at the end of the take a stop.
+        residual_rms_ns: RMS of arrival minus fitted time: queueing on the path, not the fit's
+            error.
+        lateness_ns: of `lateness_ns`, without detected delays. Near zero for a good fit.
+        has_unsure_stops: whether a stop may have been a delay or a slew, or a last delay a stop.
     """
 
     segments: tuple[ClockSegment, ...]
@@ -136,9 +129,8 @@ class ClockModel:
     ) -> Int64[np.ndarray, " n"]:
         """Host times of unwrapped device times [n], on the host's clock at the smallest path delay.
 
-        Their arrivals are needed only if the device's clock went back, to select the segment; no
-        sample is dated after its arrival. Raises InvalidInputError where they are needed and
-        missing.
+        Raises InvalidInputError where the device's clock went back, so that arrivals are needed to
+        select the segment, and they are missing. No sample is dated after its arrival.
         """
         t_device_ns = np.asarray(t_device_ns, dtype=np.int64)
         if t_host_ns is None and self.is_ambiguous:
@@ -204,11 +196,7 @@ def fit_clock(t_device_ns: np.ndarray, t_host_ns: np.ndarray) -> ClockModel:
 
 
 def lateness_ns(residual_ns: np.ndarray, host: np.ndarray) -> float:
-    """Minimum of arrival minus fitted time within five seconds, the largest of the take.
-
-    Queueing, bursts and stalls let some samples through promptly; only with a wrong fit or a
-    lasting delay are all of them late. A slow stream's seconds are ten periods long.
-    """
+    """Least lateness within five seconds (ten periods), the largest of the take."""
     if len(host) < MIN_PROMPT_SAMPLES:
         return 0.0
     second_ns = max(PROMPT_S * 1e9, MIN_PROMPT_SAMPLES * float(np.median(np.diff(host))))
@@ -278,7 +266,6 @@ def _slope(device: np.ndarray, host: np.ndarray) -> float | None:
 def _fit_segment(
     device: np.ndarray, host: np.ndarray, points: np.ndarray, slope: float | None
 ) -> ClockSegment:
-    """Fit one segment to a subset of its samples that includes its first and last one."""
     first = points[0]
     x, y, reference_ns = _offsets(device[points], host[points])
     knots = _knots(x, y) if slope is None else _straight(x, _hull(x, y).line_of_slope(slope))
@@ -330,8 +317,7 @@ class Steps(NamedTuple):
     Attributes:
         cuts: first samples after a step or a stop, in order.
         waiting: mask [n] of samples in delays of a second or more.
-        is_unsure: whether stops and delays cannot be distinguished, because the take ends or the
-            clock steps too soon after one, or stamps are irregular.
+        is_unsure: whether stops and delays cannot be distinguished.
     """
 
     cuts: list[int]
@@ -351,11 +337,10 @@ def find_steps(device: np.ndarray, host: np.ndarray) -> Steps:
     """Find steps and stops of a device's clock.
 
     A step persists, a delay does not: the minimum apparent offset of the second before is compared
-    with that of the second after. For a regular device, a step is also visible in the distance of
-    its stamps. A rise not visible there was a delay if it ended within two minutes; otherwise the
-    clock stopped, or the path delay increased permanently, which is indistinguishable. In the last
-    five seconds of a take a rise below half a second counts as a delay. Device time that goes back
-    is always a step.
+    with that of the second after, and a step also shows in the distance of a regular device's
+    stamps.
+    Other rises are delays if they end within two minutes, or come in the last five seconds and are
+    below half a second; else the clock stopped. Device time that goes back is always a step.
     """
     waiting = np.zeros(len(device), dtype=bool)
     is_unsure = False
@@ -382,10 +367,8 @@ def find_steps(device: np.ndarray, host: np.ndarray) -> Steps:
 def corrected_stamps(t_device_ns: np.ndarray, t_host_ns: np.ndarray) -> Int64[np.ndarray, " n"]:
     """Replace one or two wrong stamps in a row by whole periods from the right ones beside them.
 
-    Unwrapped device stamps and arrivals are [n]. Stamps of a regular device are wrong if those
-    beside them are whole periods apart and they are not whole periods from these. The number of
-    periods is that of the arrivals where samples are missing. Stamps of irregular devices stay as
-    they are.
+    Unwrapped device stamps and arrivals are [n]. Stamps of a regular device are wrong if they are
+    not whole periods from those beside them, which are so from each other. Others stay as they are.
     """
     device, host = np.array(t_device_ns, dtype=np.int64), np.asarray(t_host_ns)
     if len(device) < MIN_SAMPLES or not (stamps := _Stamps(device)).is_regular:
@@ -505,7 +488,6 @@ class _Levels:
 
 
 def _runs(change: np.ndarray, threshold: float) -> list[tuple[int, int]]:
-    """First and last index of every run above the threshold."""
     above = np.concatenate([[False], change > threshold, [False]])
     edges = np.flatnonzero(np.diff(above.astype(np.int8)))
     return [(int(a), int(b) - 1) for a, b in edges.reshape(-1, 2)]

@@ -1,10 +1,8 @@
 """Lower envelopes of (device time, apparent offset) points, the basis of clock fits.
 
 A sample cannot arrive before it was sent, so the true offset between two clocks lies on the
-lower edge of the cloud of apparent offsets (Moon, Skelly, Towsley 1999; Zhang, Liu, Xia 2002).
-The edge of the lower convex hull that spans a given time is the highest line through that time
-that stays below every point. The running envelope is causal, and distinguishes delays from steps of
-the device's clock: a delay is positive and transient, a step has either sign and persists.
+lower edge of the cloud of apparent offsets (Moon, Skelly, Towsley 1999; Zhang, Liu, Xia 2002): the
+edge of the lower convex hull at a time is the highest line there that stays below every point.
 """
 
 import math
@@ -80,10 +78,7 @@ class Line(NamedTuple):
 
 
 class LowerHull:
-    """Incremental lower convex hull of points in order of x; old points can be removed.
-
-    Holds at most `MAX_VERTICES` vertices: beyond that every second inner one is dropped.
-    """
+    """Incremental lower convex hull, at most `MAX_VERTICES`; old points can be removed."""
 
     def __init__(self) -> None:
         self._vertices: deque[tuple[float, float]] = deque()
@@ -142,11 +137,7 @@ class LowerHull:
 
 
 class _Trial:
-    """Check whether a line that was shifted at a step agrees with the points since then.
-
-    A restarted device samples at another phase; then it does not agree, and only the points since
-    the step, those of `hull`, are valid.
-    """
+    """Whether a line that was shifted at a step agrees with the points since then (`hull`)."""
 
     def __init__(self, hull: LowerHull) -> None:
         self.hull = hull
@@ -173,13 +164,10 @@ class RunningEnvelope:
     """Lower envelope of apparent offsets with step detection; O(vertices) time and memory.
 
     A point far below the line cannot be a delay: the clock was stepped and the line is restarted at
-    once. Points that all lie above it for a second, in device and host time, are a step too (a
-    burst of packets after a stall is a second of device time only), unless the stamps of a regular
-    device kept their distance: then the host was busy.
-
-    For a regular device, the distance of its stamps gives the size of a step modulo the period.
-    Then the line and its support points are shifted accordingly, instead of waiting for promptly
-    delivered samples; points that disagree restart it after all.
+    once. Points that all lie above it for a second, in device and host time, are a step too, unless
+    the stamps of a regular device kept their distance: then the host was busy. The distance of such
+    stamps gives the size of a step modulo the period: the line is shifted by it at once, and
+    restarted only where later points disagree.
 
     Args:
         resolution_ns: of the device's stamps; smaller steps are not detectable.
@@ -368,11 +356,7 @@ class RunningEnvelope:
 
 
 class Rhythm:
-    """Regularity of a device's stamps.
-
-    The stamps of a timer-driven device are whole periods apart, even with lost samples. Only a jump
-    of its clock, or a restart of the timer, gives an irregular distance.
-    """
+    """Regularity of a timer's stamps: whole periods apart, but where it jumps or restarts."""
 
     def __init__(self) -> None:
         self._distances: list[float] = []

@@ -1,10 +1,6 @@
-"""Host times of samples as they arrive, by device time or by counting, and unwrapped counters.
+"""Host times of samples as they arrive, by device time, counting or round trips of requests."""
 
-The clock of a steady device without stamps is its sample count. Whether a sample is late, or the
-one before it was lost, is decided from the following samples: the promptest of the next ten has
-hardly been delayed.
-"""
-
+import math
 from collections import deque
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
@@ -12,8 +8,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Int64
 
-from dextouch.clocks.envelopes import MIN_SLOPE_SPAN_S, RunningEnvelope
-from dextouch.errors import InvalidInputError, ShapeError
+from dextouch.clocks.envelopes import MIN_SLOPE_SPAN_S, LowerHull, RunningEnvelope
+from dextouch.errors import ClockFitError, InvalidInputError, ShapeError
 from dextouch.streams import StreamDescriptor
 
 # Stamps coarser than this share of the sample period are less accurate than counting samples.
@@ -33,6 +29,14 @@ MAX_WAIT = 6
 MAX_STEADY_SKEW_PPM = 20_000.0
 MAX_STEADY_LOSS = 0.1
 MAX_STEPS_PER_SAMPLE = 0.001
+# Of round trips.
+WINDOW_S = 600.0
+# Upper bound of the drift between two crystals; estimating it needs a span of exchanges.
+MAX_SKEW_PPM = 100.0
+MIN_SKEW_SPAN_S = 30.0
+MIN_SKEW_EXCHANGES = 10
+# The standard deviation of a uniform distribution is its half width over the root of three.
+BAND_SIGMA = 1 / math.sqrt(12)
 
 
 def nearest_congruent(count: int, expected: int, modulus: int) -> int:
@@ -80,10 +84,7 @@ def unwrap_counter(
 
 
 def count_lost_samples(sequence: np.ndarray, *, bits: int = 64) -> int:
-    """Number of samples that are missing from a stream's sequence [n]; none where it restarts.
-
-    The device's counter has 8 … 64 bits (64 never wraps in practice).
-    """
+    """Samples missing from a sequence [n] of 8 … 64 bits; none where the device restarts."""
     if not 8 <= bits <= 64:
         raise InvalidInputError(f"sequence: got a counter of {bits} bits, expected 8 … 64")
     numbers = np.asarray(sequence, dtype=np.int64)
@@ -97,8 +98,7 @@ class OnlineClock:
     The line under the (device time, apparent offset) points of the last minute, as in `fit_clock`,
     but causal (`RunningEnvelope`). Without device time, or where it is very coarse, the sequence
     number times the nominal period is the device's clock; without either, the arrival itself is
-    returned (`CountingClock` is more accurate for such samples, with a delay). Wrapping or coarse
-    stamps, and streams that have only a sequence number, need the stream's descriptor.
+    returned. Wrapping or coarse stamps, or sequence numbers alone, need the stream's descriptor.
     """
 
     def __init__(self, descriptor: StreamDescriptor | None = None) -> None:
@@ -130,11 +130,7 @@ class OnlineClock:
 
     @property
     def uncertainty_ns(self) -> float:
-        """How much later than estimated the last sample may have been taken; 0 if it came promptly.
-
-        A sample that is late has been delayed, or the device's timer has stood still for so long.
-        `update` assumes a delay, for ten seconds; where times must be right, skip the sample.
-        """
+        """How much later than estimated the last sample may be; 0 if it came promptly."""
         return self._envelope.uncertainty_ns
 
     def update(
@@ -142,10 +138,9 @@ class OnlineClock:
     ) -> int:
         """Corrected host time of one sample, strictly increasing.
 
-        The arrival is on the host's monotonic clock; the device's raw stamp (wrapping as in the
-        descriptor) and sequence number are None or -1 if it has none.
-
-        Raises InvalidInputError if a stamp or number that earlier samples had is missing.
+        The arrival is on the host's monotonic clock; the device's raw stamp and sequence number are
+        None
+        or -1 if it has none. Raises InvalidInputError if one that earlier samples had is missing.
         """
         device_ns = self._counter.straighten(t_host_ns, t_device_ns, sequence)
         estimate_ns = t_host_ns if device_ns is None else self._estimate(device_ns, t_host_ns)
@@ -174,11 +169,7 @@ class OnlineClock:
 
 
 class DeviceCounter:
-    """Continuous device time from stamps, or else from sequence numbers times the period.
-
-    The first sample decides: stamps if present, unless they are coarser than a quarter of the
-    period and samples are numbered. Device time is truncated to multiples of `resolution_ns`.
-    """
+    """Continuous device time of stamps or, where these are coarse, of sequence numbers."""
 
     def __init__(self, descriptor: StreamDescriptor | None) -> None:
         self._descriptor = descriptor
@@ -284,10 +275,7 @@ class CountingClock:
         )
 
     def advance(self, t_host_ns: int) -> tuple[CountedSample, ...]:
-        """Add one arrival on the host's monotonic clock; returns the samples decided by it.
-
-        Raises InvalidInputError if it precedes the last arrival.
-        """
+        """Add an arrival, not before the last one; returns the samples decided by it."""
         if self._waiting and t_host_ns < self._waiting[-1]:
             raise InvalidInputError(
                 f"counting clock: got an arrival at {t_host_ns} ns after one at "
@@ -369,10 +357,7 @@ class CountedTake:
 
 
 def date_by_counting(t_host_ns: np.ndarray, *, period_ns: int) -> CountedTake:
-    """Estimate the sample times of a steady device from its arrivals [n] alone, which are in order.
-
-    The nominal period is accurate within a few percent. Raises InvalidInputError as `advance`.
-    """
+    """Sample times of a steady device (nominal period within percents) from arrivals [n] alone."""
     clock = CountingClock(period_ns)
     counted: list[CountedSample] = []
     for arrival_ns in np.asarray(t_host_ns, dtype=np.int64).tolist():
@@ -386,3 +371,162 @@ def date_by_counting(t_host_ns: np.ndarray, *, period_ns: int) -> CountedTake:
         num_steps=clock.num_steps,
         is_steady=clock.is_steady,
     )
+
+
+@dataclass(frozen=True)
+class RoundTrip:
+    """One request with its reply; the remote stamps are equal where a device has only one."""
+
+    sent_ns: int
+    remote_received_ns: int
+    remote_sent_ns: int
+    received_ns: int
+
+    @property
+    def delay_ns(self) -> int:
+        """Round-trip delay without the remote's processing time."""
+        return self.received_ns - self.sent_ns - (self.remote_sent_ns - self.remote_received_ns)
+
+
+@dataclass(frozen=True)
+class ClockOffset:
+    """Remote clock minus local clock at one local time.
+
+    Attributes:
+        sigma_ns: standard deviation, for arbitrary asymmetry of the path delays.
+        delay_ns: minimum round-trip delay, the width of the offset's band.
+        skew_ppm: how much faster the remote clock runs.
+    """
+
+    at_local_ns: int
+    offset_ns: int
+    sigma_ns: float
+    delay_ns: float
+    skew_ppm: float
+
+
+@dataclass(frozen=True)
+class PathLatency:
+    """Constant latency between a sample and its stamp on the host's clock."""
+
+    latency_ns: int
+    sigma_ns: float
+
+
+@dataclass(frozen=True)
+class KnownSkew:
+    """How much faster a remote clock runs, with its standard deviation."""
+
+    skew_ppm: float
+    sigma_ppm: float
+
+
+class RoundTripClock:
+    """Estimates the offset between the local clock and a remote one that replies to requests.
+
+    The forward path bounds the offset from above, the return path from below; the fastest of many
+    exchanges leave a narrow band (as NTP's minimum round trip, here with drift: Zhang, Liu, Xia
+    2002). The position in the band cannot be observed: sigma accounts for it. A step of the remote
+    clock by more than the band restarts the estimate at once. `resolution_ns` is that of the remote
+    stamps.
+    """
+
+    def __init__(self, *, resolution_ns: int = 1) -> None:
+        self._resolution_ns = resolution_ns
+        self.num_steps = 0
+        self._reference: tuple[int, int] | None = None
+        self._last_ns = 0
+        self._start()
+
+    def _start(self) -> None:
+        self._upper, self._lower = LowerHull(), LowerHull()
+        self.num_exchanges = 0
+
+    def add(self, exchange: RoundTrip) -> None:
+        """Add an exchange, in order; raises InvalidInputError for a reply before its request."""
+        if exchange.received_ns < exchange.sent_ns or exchange.sent_ns < self._last_ns:
+            raise InvalidInputError(
+                f"round trip: got a question at {exchange.sent_ns} ns and its answer at "
+                f"{exchange.received_ns} ns after one at {self._last_ns} ns; expected answers "
+                "after their questions, in order, all by the same local clock"
+            )
+        if exchange.delay_ns < -self._resolution_ns:
+            raise InvalidInputError(
+                f"round trip: {exchange.delay_ns} ns on the way; the remote held the question "
+                "longer than the exchange took: check the remote stamps' unit"
+            )
+        above_ns = exchange.remote_received_ns + self._resolution_ns - exchange.sent_ns
+        below_ns = exchange.remote_sent_ns - exchange.received_ns
+        if self._reference is None:
+            self._reference = (exchange.sent_ns, below_ns)
+        self._last_ns = exchange.sent_ns
+        x_s = self._x_s(exchange.sent_ns)
+        high, low = (float(value - self._reference[1]) for value in (above_ns, below_ns))
+        if self.num_exchanges and self._contradicts(x_s, high, low):
+            self.num_steps += 1
+            self._start()
+        self._upper.add(x_s, high)
+        self._lower.add(x_s, -low)
+        self.num_exchanges += 1
+        for hull in (self._upper, self._lower):
+            hull.forget_before(x_s - WINDOW_S)
+
+    def estimate(
+        self, at_local_ns: int | None = None, *, skew: KnownSkew | None = None
+    ) -> ClockOffset:
+        """Offset at a local time; by default at the last exchange.
+
+        `skew`, of another source, is used if it is more accurate than that of the exchanges. Raises
+        ClockFitError without an exchange (`details["cause"]` is "too_few").
+        """
+        if self._reference is None:
+            raise ClockFitError("round trip clock: no exchange yet", cause="too_few")
+        at_local_ns = self._last_ns if at_local_ns is None else at_local_ns
+        x_s = self._x_s(at_local_ns)
+        slope, uncertainty = self._slope()
+        if skew is not None and skew.sigma_ppm * 1e3 < uncertainty:
+            slope, uncertainty = skew.skew_ppm * 1e3, skew.sigma_ppm * 1e3
+        high_ns, low_ns, age_s = self._band(x_s, slope)
+        width_ns = max(0.0, high_ns - low_ns)
+        drift_ns = uncertainty * age_s
+        return ClockOffset(
+            at_local_ns=at_local_ns,
+            offset_ns=self._reference[1] + round((high_ns + low_ns) / 2),
+            sigma_ns=math.hypot(width_ns * BAND_SIGMA, drift_ns),
+            delay_ns=width_ns,
+            skew_ppm=slope * 1e-3,
+        )
+
+    def latency(
+        self, *, t_remote_ns: int, t_estimated_ns: int, skew: KnownSkew | None = None
+    ) -> PathLatency:
+        """Path latency still contained in a sample's time by `OnlineClock` or `fit_clock`."""
+        offset = self.estimate(t_estimated_ns, skew=skew)
+        true_ns = t_remote_ns - offset.offset_ns
+        return PathLatency(t_estimated_ns - true_ns, offset.sigma_ns)
+
+    def _x_s(self, at_local_ns: int) -> float:
+        start_ns = 0 if self._reference is None else self._reference[0]
+        return (at_local_ns - start_ns) * 1e-9
+
+    def _slope(self) -> tuple[float, float]:
+        """Drift in ns per second, and its uncertainty."""
+        span_s = min(self._upper.span_s, self._lower.span_s)
+        if span_s < MIN_SKEW_SPAN_S or self.num_exchanges < MIN_SKEW_EXCHANGES:
+            return 0.0, MAX_SKEW_PPM * 1e3 * BAND_SIGMA * 2
+        middle_s = self._x_s(self._last_ns) - span_s / 2
+        above = self._upper.supporting_line(middle_s).slope_ns_per_s
+        below = -self._lower.supporting_line(middle_s).slope_ns_per_s
+        return (above + below) / 2, abs(above - below) / 2
+
+    def _band(self, x_s: float, slope: float) -> tuple[float, float, float]:
+        """Upper and lower bound (ns), and distance (s) from the exchanges that define them."""
+        high, low = self._upper.line_of_slope(slope), self._lower.line_of_slope(-slope)
+        age_s = max(abs(x_s - line.x_at_s) for line in (high, low))
+        return high.at(x_s), -low.at(x_s), age_s
+
+    def _contradicts(self, x_s: float, high_ns: float, low_ns: float) -> bool:
+        slope, uncertainty = self._slope()
+        band_high_ns, band_low_ns, age_s = self._band(x_s, slope)
+        slack_ns = 2 * uncertainty * age_s + self._resolution_ns
+        return high_ns < band_low_ns - slack_ns or low_ns > band_high_ns + slack_ns

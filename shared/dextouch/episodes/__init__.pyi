@@ -7,8 +7,11 @@ from .files import LocalGroup as LocalGroup
 from .files import Stamps as Stamps
 from .files import disk_errors as disk_errors
 from .files import folder_bytes as folder_bytes
+from .files import held_folder as held_folder
 from .files import make_held_folder as make_held_folder
 from .files import replace_file as replace_file
+from .files import sync_folder as sync_folder
+from .files import write_parts as write_parts
 from .format import COMMIT_FILE as COMMIT_FILE
 from .format import GOP_IMAGES as GOP_IMAGES
 from .format import KINDS as KINDS

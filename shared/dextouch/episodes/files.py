@@ -1,7 +1,4 @@
-"""Files of a store: crash-safe operations with mapped disk errors, and the sources of readers.
-
-Local files are read memory-mapped; group readers know nothing of the backend.
-"""
+"""Files of a store: crash-safe operations with mapped disk errors, and the sources of readers."""
 
 import errno
 import fcntl
@@ -82,11 +79,11 @@ def make_held_folder(path: Path) -> int:
         os.close(descriptor)
 
 
-def try_lock(folder: Path) -> int | None:
-    """Lock a folder, as `make_held_folder` does; None if a writer holds its lock."""
+def try_lock(folder: Path, *, waits: bool = False) -> int | None:
+    """Lock a folder, as `make_held_folder` does; None if it is locked, unless this `waits`."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if waits else fcntl.LOCK_NB))
     except OSError as error:
         os.close(descriptor)
         if isinstance(error, BlockingIOError):
@@ -237,14 +234,13 @@ class OpenedGroup:
     """
 
     files: GroupFiles
-    commit_name: str
     commit_sha256: str
     what: str
 
     def check_present(self, error: StorageError | None = None) -> None:
         """Raise NotFoundError if the group was deleted or replaced, and so caused `error`."""
         try:
-            commit = self.files.get_now(self.commit_name)
+            commit = self.files.get_now(COMMIT_FILE)
         except StorageError:
             return
         if commit is None or hashlib.sha256(commit).hexdigest() != self.commit_sha256:

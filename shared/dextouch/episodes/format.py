@@ -1,8 +1,4 @@
-"""Episode formats v3 and v2: file names, Zarr v3 metadata and the commit record.
-
-They differ in encoded images (`image_arrays`), in what array metadata say to other readers, and in
-the checksums that a commit record has.
-"""
+"""Episode formats v3 and v2: file names, Zarr v3 metadata and the commit record."""
 
 import hashlib
 import itertools
@@ -46,6 +42,7 @@ ZSTD_LEVEL = 1
 IMAGE_CHUNK_BYTES = (1 << 12, 1 << 16)
 # Columns of the index of encoded images.
 INDEX_COLUMNS = ("first byte", "end byte", "crc32c")
+_IMAGE_CODECS: Mapping[str, ImageCodec] = {JPEG_UNIT: "jpeg", H264_UNIT: "h264"}
 # Images per closed group of pictures.
 GOP_IMAGES = 8
 # Images that are decoded independently of all others.
@@ -158,8 +155,7 @@ def image_codec(descriptor: StreamDescriptor) -> ImageCodec | None:
 
     There is no default for images: who makes the stream (a driver, the twin, an import) names it.
     """
-    units: Mapping[str, ImageCodec] = {JPEG_UNIT: "jpeg", H264_UNIT: "h264"}
-    return units.get(descriptor.unit)
+    return _IMAGE_CODECS.get(descriptor.unit)
 
 
 def index_name(stream: str) -> str:

@@ -1,7 +1,4 @@
-"""Committed groups: their attributes and arrays, and random access to the samples of their streams.
-
-Only the samples that are requested are decoded.
-"""
+"""Committed groups: their attributes and arrays, and random access to samples of their streams."""
 
 import hashlib
 import math
@@ -13,7 +10,13 @@ from typing import Generic, TypeVar
 import numpy as np
 from jaxtyping import Int64
 
-from dextouch.episodes.encoded_images import EncodedImages, GroupChunks, IndexedBytes
+from dextouch.episodes.encoded_images import (
+    EncodedImages,
+    GroupChunks,
+    IndexedBytes,
+    inspect_chunks,
+    inspect_images,
+)
 from dextouch.episodes.files import GroupFiles, OpenedGroup
 from dextouch.episodes.format import (
     COMMIT_FILE,
@@ -33,13 +36,7 @@ from dextouch.episodes.format import (
     shard_path,
     stream_arrays,
 )
-from dextouch.episodes.image_codecs import (
-    FULL_FORM,
-    ImageForm,
-    ImageGroups,
-    transform_pixels,
-)
-from dextouch.episodes.inspection import inspect_chunks, inspect_images
+from dextouch.episodes.image_codecs import FULL_FORM, ImageForm, ImageGroups, transform_pixels
 from dextouch.episodes.shards import ShardReader
 from dextouch.episodes.trash import NOTES_FILE, read_remark
 from dextouch.errors import (
@@ -71,7 +68,7 @@ class GroupContents(Generic[A]):
     opened: OpenedGroup
     version: Version
     _shards: dict[str, ShardReader] = field(default_factory=dict)
-    _images: dict[str, EncodedImages | None] = field(default_factory=dict)
+    _images: dict[str, EncodedImages] = field(default_factory=dict)
 
     def shard(self, name: str) -> ShardReader:
         """Reader of one array; its shard index is cached."""
@@ -83,19 +80,17 @@ class GroupContents(Generic[A]):
 
     def images(self, descriptor: StreamDescriptor) -> EncodedImages | None:
         """The encoded images of a stream, and what was cached of them; None of other streams."""
-        name = descriptor.name
-        if name not in self._images:
-            self._images[name] = self._images_of(name, descriptor)
-        return self._images[name]
-
-    def _images_of(self, name: str, descriptor: StreamDescriptor) -> EncodedImages | None:
-        codec = image_codec(descriptor)
+        name, codec = descriptor.name, image_codec(descriptor)
         if codec is None:
             return None
-        groups = ImageGroups(codec, descriptor.shape, f"{self.what}: array {name!r}")
-        if self.version == 2:
-            return GroupChunks(groups, self.shard(name))
-        return IndexedBytes(groups, self.shard(name), self.shard(index_name(name)))
+        if name not in self._images:
+            groups = ImageGroups(codec, descriptor.shape, f"{self.what}: array {name!r}")
+            self._images[name] = (
+                GroupChunks(groups, self.shard(name))
+                if self.version == 2
+                else IndexedBytes(groups, self.shard(name), self.shard(index_name(name)))
+            )
+        return self._images[name]
 
     def inspect_array(
         self, name: str, *, progress: Callable[[int], None] = lambda _: None
@@ -152,7 +147,7 @@ def read_group(files: GroupFiles, model: type[A]) -> GroupContents[A]:
     commit = files.get(COMMIT_FILE)
     if commit is None:
         raise CorruptDataError(f"{what}: {COMMIT_FILE} is missing")
-    opened = OpenedGroup(files, COMMIT_FILE, sha256_hex(commit), what)
+    opened = OpenedGroup(files, sha256_hex(commit), what)
     try:
         return _read_group(opened, commit, kind, model)
     except StorageError as error:

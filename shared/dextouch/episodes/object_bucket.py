@@ -1,7 +1,4 @@
-"""S3 buckets: their URLs, `s3://bucket/prefix?option=value`, and requests to one bucket.
-
-Errors of obstore, which no other module uses, are mapped to DexTouch errors.
-"""
+"""S3 buckets: their URLs, `s3://bucket/prefix?option=value`, and requests to one bucket."""
 
 import builtins
 import hashlib
@@ -177,17 +174,6 @@ class LruCache:
 _OWNER: list[int] = []
 
 
-def _refuse_forks(what: str) -> None:
-    if not _OWNER:
-        _OWNER.append(os.getpid())
-    if os.getpid() not in _OWNER:
-        raise UnavailableError(
-            f"{what}: object storage was used before this process was forked, which the "
-            "connection does not survive; start workers with 'spawn' or 'forkserver' "
-            "(DataLoader: multiprocessing_context='spawn')"
-        )
-
-
 class Bucket:
     """One bucket below one prefix, with a cache of object blocks for its readers.
 
@@ -306,7 +292,14 @@ class Bucket:
         StorageError is a refusal because of credentials, bucket or permissions, UnavailableError no
         answer, or an overloaded service.
         """
-        _refuse_forks(self.url(key))
+        if not _OWNER:
+            _OWNER.append(os.getpid())
+        if os.getpid() not in _OWNER:
+            raise UnavailableError(
+                f"{self.url(key)}: object storage was used before this process was forked, which "
+                "the connection does not survive; start workers with 'spawn' or 'forkserver' "
+                "(DataLoader: multiprocessing_context='spawn')"
+            )
         try:
             yield
         except FileNotFoundError as error:

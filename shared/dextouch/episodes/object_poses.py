@@ -1,8 +1,4 @@
-"""Poses of an episode's objects: from its streams at any time, and from clicks at its first step.
-
-A clicked pixel is a ray; where the ray meets the height of the clicked point over the table, there
-the point is. Of an object that is not symmetric, a second click says where it points.
-"""
+"""Poses of an episode's objects: from its streams at any time, and clicks at its first step."""
 
 from dataclasses import dataclass
 from typing import Final, Literal

@@ -18,8 +18,7 @@ from pathlib import Path
 
 import structlog
 
-from dextouch.data_folder import is_system_file
-from dextouch.episodes.files import Stamps, disk_errors, unheld_folders, write_file
+from dextouch.episodes.files import LocalGroup, Stamps, disk_errors, unheld_folders, write_file
 from dextouch.episodes.format import (
     COMMIT_FILE,
     KINDS,
@@ -459,13 +458,10 @@ def _is_committed(bucket: Bucket, group: str, content: str, name: str) -> bool:
 
 
 def _put_files(bucket: Bucket, group: str, folder: Path) -> None:
-    paths = sorted(path for path in folder.rglob("*") if path.is_file())
-    files = {path.relative_to(folder).as_posix(): path for path in paths}
-    files = {name: path for name, path in files.items() if not is_system_file(name)}
-    del files[COMMIT_FILE]
+    names = [name for name in LocalGroup(folder).names() if name != COMMIT_FILE]
     with ThreadPoolExecutor(_PARALLEL_REQUESTS) as pool:
         # The first failure cancels what has not begun.
-        for _ in pool.map(bucket.put, [f"{group}/{name}" for name in files], files.values()):
+        for _ in pool.map(lambda name: bucket.put(f"{group}/{name}", folder / name), names):
             pass
 
 

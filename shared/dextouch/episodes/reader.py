@@ -1,7 +1,4 @@
-"""Readers of episodes and recordings: streams by time, and windows on the model grid.
-
-Windows also have a form on the wire (msgpack).
-"""
+"""Readers of episodes and recordings: streams by time, and windows on the model grid."""
 
 import os
 from collections.abc import Callable, Iterable

@@ -26,16 +26,16 @@ def write_rollout(
 
     Args:
         store: destination.
-        attributes: of the episode, without `streams`.
+        attributes: without `streams`.
         observations: of step 0 and of every chunk; at least one has images of the head camera.
         commanded: [T, 67] actions, row 0 the poses of step 0.
-        layout: of the taxels, as the world describes it; None of `dextouch_v1`.
+        layout: of the taxels, None of `dextouch_v1`.
     """
     rate_hz = attributes.model_rate_hz
     tactile = np.concatenate([observation.tactile_kpa for observation in observations])
-    shown = [observation for observation in observations if HEAD_CAMERA in observation.images]
-    images = np.concatenate([observation.images[HEAD_CAMERA] for observation in shown])
-    shown_steps = np.concatenate([one.first_step + np.arange(len(one)) for one in shown])
+    with_images = [observation for observation in observations if HEAD_CAMERA in observation.images]
+    images = np.concatenate([observation.images[HEAD_CAMERA] for observation in with_images])
+    shown_steps = np.concatenate([one.first_step + np.arange(len(one)) for one in with_images])
     reached = np.concatenate([observation.action_reached for observation in observations])
     t_ref_ns = np.round(np.arange(len(tactile)) * 1e9 / rate_hz).astype(np.int64)
     streams: list[tuple[str, StreamKind, str, np.ndarray]] = [

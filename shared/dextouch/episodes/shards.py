@@ -412,16 +412,12 @@ class ShardWriter:
     def _write_rows(self) -> None:
         data = self._chunk.tobytes()
         num_rows = self._num_pending
-        self._write(self._indexed(compress(data)))
+        chunk = with_crc(compress(data))
+        self._crcs += chunk[-CRC_BYTES:]
+        self._index.append((sum(self._index[-1]) if self._index else 0, len(chunk)))
+        self._write(chunk)
         self._sha256.update(memoryview(data)[: num_rows * (len(data) // len(self._chunk))])
         self._num_pending = 0
-
-    def _indexed(self, payload: bytes) -> bytes:
-        """The next storage chunk with its checksum, entered in the index."""
-        data = with_crc(payload)
-        self._crcs += data[-CRC_BYTES:]
-        self._index.append((sum(self._index[-1]) if self._index else 0, len(data)))
-        return data
 
     def _write(self, part: bytes | memoryview) -> None:
         self._parts.append(part)

@@ -1,7 +1,5 @@
 """Files of a spool: its checksummed record file, attributes, and the seal of a closed one.
 
-The record file is append-only and shared by all streams of the spool.
-
 A record is a header with its own offset and checksum, followed by the body of a batch
 (`dextouch.streams.batch`). All streams share one file, so that a single sync covers them. A torn
 tail differs from damage in that no valid header follows it.

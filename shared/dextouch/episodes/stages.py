@@ -1,12 +1,9 @@
-"""Stages, the folders of unfinished items: made, swept after a kill, and renamed on commit.
-
-A writer fills a stage; what an interrupted one leaves is never read.
-"""
+"""Stages, the folders of unfinished items: made, swept after a kill, and renamed on commit."""
 
 import errno
 import shutil
 import uuid
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from dextouch.episodes.files import (
@@ -45,21 +42,13 @@ def new_stage(root: Path, kind: Kind, item_id: str) -> Path:
     return root / STAGING / f"{kind}-{item_id}-{uuid.uuid4().hex}"
 
 
-def sweep_stages(root: Path) -> int:
+def sweep_stages(root: Path, places: Iterable[str] = (STAGING, DOWNLOADS)) -> int:
     """Remove abandoned stages and downloads, which a kill has left, and return their number."""
-    return _sweep(root / STAGING) + sweep_downloads(root)
-
-
-def sweep_downloads(root: Path) -> int:
-    """Remove abandoned downloads, and return their number."""
-    return _sweep(root / DOWNLOADS)
-
-
-def _sweep(parent: Path) -> int:
     removed = 0
-    for folder in unheld_folders(parent):
-        shutil.rmtree(folder)
-        removed += 1
+    for place in places:
+        for folder in unheld_folders(root / place):
+            shutil.rmtree(folder)
+            removed += 1
     return removed
 
 

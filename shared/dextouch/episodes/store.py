@@ -1,6 +1,5 @@
 """Store of episodes and recordings in a folder or a bucket: open, list, write, delete by id."""
 
-import fcntl
 import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -17,6 +16,7 @@ from dextouch.episodes.files import (
     folder_bytes,
     replace_file,
     sync_folder,
+    try_lock,
 )
 from dextouch.episodes.format import (
     ATTRIBUTES,
@@ -37,6 +37,7 @@ from dextouch.episodes.trash import (
     NOTES_FILE,
     REMARK_FILES,
     REVIEW_FILE,
+    Remark,
     TrashEntry,
     TrashKind,
     change_trashed_review,
@@ -186,8 +187,11 @@ class EpisodeStore:
 
         Raises NotFoundError without the id, CorruptDataError if its review cannot be read.
         """
+        return self._remark(kind, item_id, REVIEW_FILE, Review)
+
+    def _remark(self, kind: Kind, item_id: str, name: str, form: type[Remark]) -> Remark | None:
         group = self._storage.group(*_check(kind, item_id))
-        return read_remark(group, REVIEW_FILE, Review, what=f"{kind} {item_id!r}")
+        return read_remark(group, name, form, what=f"{kind} {item_id!r}")
 
     def set_review(self, item_id: str, review: Review | None, *, kind: Kind = "episode") -> None:
         """Keep the review of an item in place of an earlier one; None removes it.
@@ -236,8 +240,7 @@ class EpisodeStore:
 
     def clicks(self, episode_id: str) -> EpisodeClicks | None:
         """Clicks on the objects of an episode; None if there are none. Raises as `review`."""
-        group = self._storage.group(*_check("episode", episode_id))
-        return read_remark(group, CLICKS_FILE, EpisodeClicks, what=f"episode {episode_id!r}")
+        return self._remark("episode", episode_id, CLICKS_FILE, EpisodeClicks)
 
     def set_clicks(self, episode_id: str, clicks: EpisodeClicks | None) -> None:
         """Keep clicks in place of earlier ones; None removes them. Raises as `set_review`."""
@@ -245,9 +248,7 @@ class EpisodeStore:
 
     def notes(self, item_id: str, *, kind: Kind = "episode") -> ItemNotes:
         """Notes on time ranges of an item. Raises as `review`."""
-        group = self._storage.group(*_check(kind, item_id))
-        what = f"{kind} {item_id!r}"
-        return read_remark(group, NOTES_FILE, ItemNotes, what=what) or ItemNotes()
+        return self._remark(kind, item_id, NOTES_FILE, ItemNotes) or ItemNotes()
 
     def change_notes(
         self, item_id: str, change: Callable[[ItemNotes], ItemNotes], *, kind: Kind = "episode"
@@ -314,21 +315,18 @@ class EpisodeStore:
 
     def restore(self, item_id: str, *, kind: TrashKind = "episode") -> None:
         """Restore the last deleted group of an id; raises as `restore_from_trash`."""
-        restore_from_trash(self._trash_root(), kind, check_id(item_id))
+        restore_from_trash(self.require_trash(), kind, check_id(item_id))
 
     def trash_list(self) -> Sequence[TrashEntry]:
         """Contents of the trash, oldest first."""
-        return list_trash(self._trash_root())
+        return list_trash(self.require_trash())
 
     def purge(self, *, older_than_s: float = 0.0) -> Sequence[TrashEntry]:
         """Permanently delete trash older than `older_than_s` and return the deleted entries."""
-        return purge_trash(self._trash_root(), older_than_s=older_than_s)
+        return purge_trash(self.require_trash(), older_than_s=older_than_s)
 
-    def require_trash(self) -> None:
-        """Raise InvalidInputError for a store in a bucket, which has no trash to restore from."""
-        self._trash_root()
-
-    def _trash_root(self) -> Path:
+    def require_trash(self) -> Path:
+        """The folder; raises InvalidInputError for a store in a bucket, which has no trash."""
         if not isinstance(self._storage, _LocalStorage):
             raise InvalidInputError(
                 "trash: got a store in a bucket, expected one in a folder; what is deleted from a "
@@ -501,24 +499,19 @@ class _LocalStorage:
     @contextmanager
     def held(self, kind: Kind, item_id: str, *, waits: bool) -> Iterator[None]:
         """Hold the lock of a group's folder, which is that of a deletion, too."""
-        what = f"hold {kind} {item_id}"
-        with disk_errors(what):
+        with disk_errors(f"hold {kind} {item_id}"):
             try:
-                folder = os.open(self.group(kind, item_id).folder, os.O_RDONLY)
+                lock = try_lock(self.group(kind, item_id).folder, waits=waits)
             except FileNotFoundError as error:
                 raise self._missing(kind, item_id) from error
+        if lock is None:
+            raise UnavailableError(
+                f"{kind} {item_id!r}: another program is changing it; try again when it is done"
+            )
         try:
-            with disk_errors(what):
-                try:
-                    fcntl.flock(folder, fcntl.LOCK_EX | (0 if waits else fcntl.LOCK_NB))
-                except BlockingIOError as error:
-                    raise UnavailableError(
-                        f"{kind} {item_id!r}: another program is changing it; try again when it is "
-                        "done"
-                    ) from error
             yield
         finally:
-            os.close(folder)
+            os.close(lock)
 
     def sweep(self) -> int:
         with disk_errors("sweep"):

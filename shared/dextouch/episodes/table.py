@@ -1,8 +1,4 @@
-"""Episodes as networks learn from them: which are fit, their arrays on the model grid, one hash.
-
-World models, tokenizers, success classifiers, cloned policies and the figures of predictions all
-select episodes here and read them through `EpisodeGrid`, so that they agree on what an episode is.
-"""
+"""Episodes as networks learn from them: which are fit, their arrays on the model grid, one hash."""
 
 import hashlib
 import math
@@ -21,7 +17,7 @@ from dextouch.episodes.object_poses import ObjectTrack, object_track
 from dextouch.episodes.reader import OWN_IMAGE_SHARE, EpisodeReader
 from dextouch.episodes.splits import Split, is_in, recording_of, scene_of, split_of
 from dextouch.episodes.store import EpisodeStore
-from dextouch.episodes.validity import interpolated_actions, measured_actions, measured_taxels
+from dextouch.episodes.validity import interpolated_actions, measured_actions
 from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
 from dextouch.geometry import undistorted
 from dextouch.hands.actions import AnchorPoses
@@ -300,7 +296,7 @@ class EpisodeGrid:
     @property
     def measured_taxels(self) -> Bool[np.ndarray, "2 taxels"]:
         """Taxels that were measured; the others, which alignment refused, are zero throughout."""
-        return measured_taxels(self.about.calibration, self.tactile_layout.num_taxels)
+        return self.reader.measured_taxels
 
     @property
     def tactile_layout(self) -> TactileLayout:

@@ -94,9 +94,7 @@ def interpolated_actions(
 
 
 def measured_actions(
-    about: EpisodeAttributes,
-    t_ref_ns: Int64[np.ndarray, " steps"],
-    kind: ActionKind = "measured",
+    about: EpisodeAttributes, t_ref_ns: Int64[np.ndarray, " steps"], kind: ActionKind = "measured"
 ) -> Bool[np.ndarray, "steps 67"]:
     """Columns of actions that were measured (or commanded), neither interpolated nor absent."""
     return ~(

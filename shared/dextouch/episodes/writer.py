@@ -1,8 +1,4 @@
-"""Writer of a new episode or recording, stream by stream, which appears atomically on commit.
-
-It is written in a folder of its own, the stage. What an interrupted writer leaves of a stage is
-never read: a sweep removes it.
-"""
+"""Writer of a new episode or recording, stream by stream, which appears atomically on commit."""
 
 import hashlib
 import os
@@ -10,6 +6,7 @@ import shutil
 from collections import deque
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack
 from itertools import accumulate
 from pathlib import Path
 
@@ -211,14 +208,11 @@ class EpisodeWriter:
 
     def _leave(self) -> None:
         """Close the files and remove the stage, which a commit has moved away."""
-        try:
+        with ExitStack() as stack:
+            stack.callback(os.close, self._lock)
+            stack.callback(shutil.rmtree, self._stage, ignore_errors=True)
             for stream in self._streams.values():
-                stream.close()
-        finally:
-            try:
-                shutil.rmtree(self._stage, ignore_errors=True)
-            finally:
-                os.close(self._lock)
+                stack.callback(stream.close)
 
     def _commit(self) -> None:
         if self._taken is not None:
@@ -431,7 +425,6 @@ class _EncodedImages:
         return data
 
     def index_rows(self, images: list[bytes]) -> np.ndarray:
-        """Rows of the index for the next images."""
         bounds = list(accumulate(map(len, images), initial=self._num_bytes))
         self._num_bytes = bounds[-1]
         crcs = map(google_crc32c.value, images)
@@ -472,7 +465,6 @@ class _ImageQueue:
         self._num_images += len(values)
 
     def drain(self) -> None:
-        """Wait until the queue is empty; raises as `put`."""
         while self._waiting:
             self._take_oldest()
 

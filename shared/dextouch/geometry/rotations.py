@@ -80,10 +80,7 @@ def rotation_from_6d(columns: np.ndarray) -> Float64[np.ndarray, "*batch 3 3"]:
 
 
 def rotation_from_quaternion(q_wxyz: np.ndarray) -> Float64[np.ndarray, "*batch 3 3"]:
-    """Rotation matrices from quaternions [..., 4] (w, x, y, z) of any positive length.
-
-    Raises DegenerateRotationError for one that is (nearly) zero, and as `rotation_to_6d`.
-    """
+    """Rotations of quaternions [..., 4] (w, x, y, z); DegenerateRotationError near zero."""
     q = _checked(q_wxyz, (4,), "quaternion")
     norm = np.linalg.norm(q, axis=-1, keepdims=True)
     if (norm < 1e-9).any():

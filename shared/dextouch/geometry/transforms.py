@@ -1,9 +1,7 @@
 """Rigid transforms as 4×4 matrices, interpolation in time, and cameras with lens distortion.
 
 Points of a camera are in its optical frame (x right, y down, z forward). `K` and `distortion`
-(k1 k2 p1 p2 k3) are those of OpenCV's model, which calibration estimates; the first pixel spans
-0 … 1. Images are stored as the camera took them; what learns from them reads them without
-distortion (`undistorted`).
+(k1 k2 p1 p2 k3) are those of OpenCV's model; the first pixel spans 0 … 1.
 """
 
 import math
@@ -95,10 +93,7 @@ def pose_from_transform(T: np.ndarray) -> Float64[np.ndarray, "*batch 7"]:
 
 
 def pinhole_matrix(*, width_px: int, height_px: int, fovy_rad: float) -> Float64[np.ndarray, "3 3"]:
-    """K of an ideal camera with square pixels and its principal point at the image centre.
-
-    Pixel centres lie at half-integers (the first pixel spans 0 … 1), so cx = width / 2.
-    """
+    """K of an ideal camera with square pixels; the first one spans 0 … 1, so cx = width / 2."""
     focal_px = 0.5 * height_px / np.tan(0.5 * fovy_rad)
     return np.array(
         [[focal_px, 0.0, 0.5 * width_px], [0.0, focal_px, 0.5 * height_px], [0.0, 0.0, 1.0]]
@@ -116,9 +111,8 @@ def project(
 ) -> tuple[Float64[np.ndarray, "*batch 2"], Bool[np.ndarray, "*batch"]]:
     """Pixels [..., 2] of points [..., 3] in metres, and whether each lies in front of the camera.
 
-    Points nearer than 1 cm are projected as if at that depth and marked False. `K` is in pixels;
-    `distortion` is k1 k2 p1 p2 k3 of the lens, for images as the camera took them, None for a
-    pinhole, as for undistorted images.
+    Points nearer than 1 cm are projected as if at that depth and marked False. `K` is in pixels,
+    `distortion` k1 k2 p1 p2 k3, None for a pinhole, as for undistorted images.
     """
     points = np.asarray(points_camera, dtype=np.float64)
     flat = points[..., :2] / np.maximum(points[..., 2:], _LEAST_DEPTH_M)
@@ -255,10 +249,9 @@ def box_pixels(
     camera: tuple[np.ndarray, np.ndarray],
     T_world_camera: np.ndarray,
 ) -> Float64[np.ndarray, "8 2"]:
-    """Pixels of the corners of a box (centre, half sizes in the object's frame).
+    """Pixels of the corners of a box (centre, half sizes in its frame); NaN behind the camera.
 
-    Corner number i has the upper x, y, z where bit 0, 1, 2 of i is set. Corners behind the camera
-    have NaN.
+    Corner number i has the upper x, y, z where bit 0, 1, 2 of i is set.
     """
     box = np.asarray(box_m, dtype=np.float64)
     signs = np.array([[1 if index >> axis & 1 else -1 for axis in range(3)] for index in range(8)])

@@ -82,11 +82,7 @@ def action_names(*, has_robot_joints: bool = True) -> list[str]:
 
 
 def check_actions(actions: np.ndarray, *, where: str = "actions") -> Float64[np.ndarray, "time 67"]:
-    """Validate actions and return them as float64 [T, 67].
-
-    Raises ShapeError unless they are [T ≥ 1, 67], NonFiniteError for NaN or infinity, with the
-    place.
-    """
+    """Actions as float64 [T ≥ 1, 67]; raises ShapeError, or NonFiniteError with the place."""
     checked = np.asarray(actions, dtype=np.float64)
     if checked.ndim != 2 or checked.shape[1] != ACTION_DIM or len(checked) == 0:
         raise ShapeError(f"{where}: got shape {checked.shape}, expected [T ≥ 1, {ACTION_DIM}]")
@@ -172,11 +168,10 @@ def unpack_action(actions: np.ndarray) -> ActionParts:
 def actions_from_poses(
     trajectory: HandTrajectory, anchor: AnchorPoses
 ) -> Float64[np.ndarray, "time 67"]:
-    """Actions of absolute poses, relative to the anchor's poses.
+    """Actions of absolute poses relative to the anchor's, whose own is exactly the identity.
 
     For measured actions the anchor is the trajectory's own first step; commanded actions are
-    relative to the *measured* poses of the anchor step. Where a pose is the anchor's own, its
-    action is exactly the identity.
+    relative to the *measured* poses of the anchor step.
     """
     T_left, T_right, T_camera = anchor.as_tuple()
     return pack_action(
@@ -226,11 +221,9 @@ def reanchor(
 ) -> Float64[np.ndarray, "time 67"]:
     """Re-express actions [T, 67], all relative to one anchor, relative to the step at `index`.
 
-    The poses of that step come out as exactly the identity. `anchor_action` [67], relative to the
-    same anchor as `actions`, is the source of the new anchor instead of `actions[index]`. Commanded
-    actions need it: their anchor is the *measured* action of the step.
-
-    Raises InvalidInputError for an index outside 0 … T-1.
+    The poses of that step come out as exactly the identity. Commanded actions need `anchor_action`
+    [67], the *measured* action of the step relative to the same anchor. Raises InvalidInputError
+    for an index outside 0 … T-1.
     """
     checked = check_actions(actions)
     if not 0 <= index < len(checked):

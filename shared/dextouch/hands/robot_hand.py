@@ -1,10 +1,8 @@
 """Kinematic models of robot hands: joint names, limits and forward kinematics in the wrist frame.
 
-`HandModel` is built from finger tables (of a module or, by `dextouch.hands.hand_files`, of a file);
-`RobotHand` is the Wuji Hand 2. Hinges of a finger are ordered from the wrist outwards. Each has a
-frame in its parent's frame (the first: in the wrist frame), rotates about an axis of its own frame,
-and has limits. All hands share one wrist frame: fingers along -z, the thumb side +x,
-the right palm faces +y, the left -y.
+Hinges of a finger are ordered from the wrist outwards, each in its parent's frame (the first: the
+wrist's), about an axis of its own frame. All hands share one wrist frame: fingers along -z, the
+thumb side +x, the right palm faces +y, the left -y.
 """
 
 import json
@@ -61,11 +59,7 @@ class FingerTable(NamedTuple):
 
 @dataclass(frozen=True)
 class _Chains:
-    """Hinges of the fingers of one hand or, with a further first axis, of several alike.
-
-    Fingers are padded to the longest one; `is_joint` is the mask of existing hinges. `points` are
-    indices of hinges, as those of a `FingerTable`.
-    """
+    """Hinges of one hand's fingers, or several hands', padded to the longest finger."""
 
     is_joint: Bool[np.ndarray, "*hands fingers hinges"]
     offsets: Float64[np.ndarray, "*hands fingers hinges 4 4"]
@@ -188,12 +182,10 @@ class HandModel:
 class RobotHand(HandModel):
     """Wuji Hand 2 (Beta 2): five fingers × four hinges, thumb … little, from the wrist outwards.
 
-    The four hinges of a finger are S1 flexion, S2 abduction, S3 and S4 flexion; the order is the
-    firmware's. The tables of both hands, which are not exact mirrors, are in `wuji_hand_2.json`:
-    the exact values of the manufacturer's MJCF (MIT, (c) 2025 Wuji Technology; `aiowuji` 0.1.0 on
-    PyPI), the fingertips its sites `*_tip` (tests/accuracy/test_hand_model.py compares).
-
-    Raises UnknownNameError for a side other than "left" and "right".
+    The four hinges of a finger are S1 flexion, S2 abduction, S3 and S4 flexion. The tables of both
+    hands, which are not exact mirrors, are in `wuji_hand_2.json`: the exact values of the
+    manufacturer's MJCF (MIT, (c) 2025 Wuji Technology; `aiowuji` 0.1.0 on PyPI), fingertips its
+    sites `*_tip`. Raises UnknownNameError for a side other than "left" and "right".
     """
 
     def __init__(self, side: str) -> None:
@@ -201,10 +193,7 @@ class RobotHand(HandModel):
 
 
 def chain_points_of_both_m(joints_rad: np.ndarray) -> Float64[np.ndarray, "time 2 5 4 3"]:
-    """`RobotHand.chain_points_m` of both hands, in little more time than of one.
-
-    Joint angles [T, 2, 20] are finite, left before right.
-    """
+    """`RobotHand.chain_points_m` of finite angles [T, 2, 20] of both hands, left before right."""
     chains = _both_hands()
     angles_rad = np.asarray(joints_rad, dtype=np.float64).reshape(-1, *chains.axes.shape[:-1])
     return chains.points_m(chains.frames(angles_rad))

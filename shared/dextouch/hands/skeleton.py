@@ -1,9 +1,8 @@
 """Human hand skeleton of 25 tracked keypoints, identified by chain and joint, and its mean shape.
 
-Bone lengths of the mean hand, the reference for the orientation of tracked hands, are adult means
-(Buryanov and Kotiuk 2010). Position and spread of the metacarpals are our estimate from common
-anatomy; they define our wrist axes of a human hand: -z along the third metacarpal, x across the
-palm to the thumb's side, y through the palm.
+Bone lengths are adult means (Buryanov and Kotiuk 2010); position and spread of the metacarpals are
+our estimate. They define our wrist axes of a human hand: -z along the third metacarpal, x across
+the palm to the thumb's side, y through the palm.
 """
 
 from collections import Counter
@@ -58,19 +57,13 @@ def chain_indices(chain: str) -> list[int]:
 
 
 def solver_indices(chain: str) -> list[int]:
-    """The four keypoints of a chain that a 4-joint finger can follow: MCP, PIP, DIP, tip.
-
-    For the thumb: metacarpal (CMC), proximal (MCP), distal (IP), tip.
-    """
+    """Keypoints that a 4-joint finger follows: MCP, PIP, DIP, tip (thumb: CMC, MCP, IP, tip)."""
     return chain_indices(chain)[-4:]
 
 
 @lru_cache(maxsize=2)
 def mean_hand_m(side: str) -> Float64[np.ndarray, "25 3"]:
-    """The 25 keypoints of the mean hand, flat, in wrist axes, metres; read-only.
-
-    Raises UnknownNameError for a side other than "left" and "right".
-    """
+    """Keypoints of the mean hand, flat, in wrist axes (m); raises UnknownNameError for a side."""
     if side not in ("left", "right"):
         raise UnknownNameError("side", side, ["left", "right"])
     points = np.zeros((NUM_KEYPOINTS, 3))
@@ -123,20 +116,13 @@ _THUMB_WORDS: Final = (("cmc", "mcp", "ip", "tip"), ("mcp", "pip", "dip", "tip")
 
 @dataclass(frozen=True)
 class NodeOrder:
-    """Assignment of a tracker's nodes to keypoints.
-
-    `places` are our keypoint indices of the tracker's nodes, −1 for a palm; `absent` nodes it
-    lacks.
-    """
+    """Our keypoint index of each node of a tracker, −1 for a palm, and the nodes that it lacks."""
 
     places: tuple[int, ...]
     absent: tuple[Node, ...]
 
     def keypoints(self, points: np.ndarray) -> Float64[np.ndarray, "*batch 25 3"]:
-        """Reorder a tracker's points [..., n, 3] to our keypoints; NaN where absent.
-
-        Raises ShapeError for another number of points than nodes.
-        """
+        """Our keypoints of a tracker's points [..., n, 3], NaN where absent; raises ShapeError."""
         array = np.asarray(points, dtype=np.float64)
         if array.shape[-2:] != (len(self.places), 3):
             raise ShapeError(
@@ -153,10 +139,9 @@ def node_order(nodes: Sequence[Node], *, may_lack: Collection[Node] = ()) -> Nod
     """Assign a tracker's nodes, given in its order by chain and joint; case-insensitive.
 
     Chains are by our names ("pinky" is "little", the chain "hand" the wrist), joints of a chain all
-    by our names, or all by medicine's (CMC MCP PIP DIP TIP), or as MANUS's ROS 2 node misnames
-    them. A palm is ignored. Nodes that the tracker `may_lack` are such as `FINGER_METACARPALS`.
-
-    Raises InvalidInputError for unknown, missing or duplicate nodes, which it lists.
+    by our names, by medicine's (CMC MCP PIP DIP TIP), or as MANUS's ROS 2 node misnames them. A
+    palm is ignored. Raises InvalidInputError for unknown, duplicate or missing nodes that it does
+    not `may_lack`.
     """
     translated = _in_our_words(nodes)
     counts = Counter(node for node in translated if node is not None)

@@ -1,7 +1,4 @@
-"""PSNR (dB) and SSIM of predicted 8-bit colour images, errors of depth, and the check of arrays.
-
-PSNR and SSIM are averaged over images, so the value of a clip is the mean over its images.
-"""
+"""PSNR (dB) and SSIM, means over 8-bit colour images, errors of depth, and the check of arrays."""
 
 import numpy as np
 from jaxtyping import Float64
@@ -18,10 +15,7 @@ _SSIM_SIGMA_PX = 1.5
 def checked_pair(
     first: np.ndarray, second: np.ndarray, *, what: str, tail: tuple[int | None, ...]
 ) -> tuple[Float64[np.ndarray, "..."], Float64[np.ndarray, "..."]]:
-    """Validate two arrays of equal shape and return them as float64.
-
-    `tail` are the expected last axes; None stands for any length of at least one.
-    """
+    """Two arrays of equal shape as float64; None in `tail`, the last axes, is any length."""
     a, b = np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64)
     if a.shape != b.shape:
         raise ShapeError(f"{what}: got shapes {a.shape} and {b.shape}, expected the same shape")
@@ -46,9 +40,8 @@ def checked_pair(
 def psnr(*, predicted: np.ndarray, true: np.ndarray) -> float:
     """Mean over images of 10 log10(255² / MSE) in dB, each image capped at 100 dB.
 
-    Images [..., h, w, 3] are in 0 … 255 (uint8, or a float that was not yet rounded).
-
-    Raises ShapeError for different or other shapes, NonFiniteError for NaN or infinity.
+    Images [..., h, w, 3] are in 0 … 255 (uint8, or a float that was not yet rounded). Raises
+    ShapeError for different or other shapes, NonFiniteError for NaN or infinity.
     """
     a, b = checked_pair(predicted, true, what="PSNR of images", tail=(None, None, 3))
     mse = np.mean((a - b) ** 2, axis=(-3, -2, -1))

@@ -1,8 +1,4 @@
-"""Agreement between policy scores in reality and in imagination: correlations, MMRV, bias.
-
-Arguments are keyword-only: MMRV is not symmetric, and swapping real and imagined is an easy
-mistake. Undefined values are NaN, never 0 or 1.
-"""
+"""Agreement between policy scores in reality and in imagination; NaN where undefined."""
 
 from typing import Final
 
@@ -25,10 +21,7 @@ def _scores(real: np.ndarray, imagined: np.ndarray, what: str) -> tuple[np.ndarr
 
 
 def pearson(*, real: np.ndarray, imagined: np.ndarray) -> float:
-    """Linear correlation of scores [policies], in −1 … 1.
-
-    NaN when undefined: fewer than three policies, or all scores of one side equal.
-    """
+    """Linear correlation in −1 … 1; NaN for fewer than three policies, or equal scores."""
     a, b = _scores(real, imagined, "Pearson")
     if len(a) < MIN_POLICIES or _all_equal(a) or _all_equal(b):
         return float("nan")
@@ -46,10 +39,7 @@ def spearman(*, real: np.ndarray, imagined: np.ndarray) -> float:
 
 
 def kendall(*, real: np.ndarray, imagined: np.ndarray) -> float:
-    """Kendall's τ-b: concordant minus discordant pairs, corrected for ties.
-
-    NaN when undefined: fewer than three policies, or all scores of one side equal.
-    """
+    """Kendall's τ-b, corrected for ties; NaN for fewer than three policies, or equal scores."""
     a, b = _scores(real, imagined, "Kendall")
     if len(a) < MIN_POLICIES:
         return float("nan")

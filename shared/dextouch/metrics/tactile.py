@@ -1,8 +1,7 @@
 """Tactile errors (kPa) and contact agreement of predicted taxel pressures [..., taxels].
 
-Everything pools over all given samples, hands and taxels (micro average). Contact is pressure of
-at least 2 kPa (`dextouch.tactile.layout`). NaN is refused, but where `measured` is false: what was
-not measured counts nowhere, or, in SSIM, as right; None: all was. `layout` is that of the glove.
+All given samples, hands and taxels are pooled. NaN is refused, but where `measured` is false: what
+was not measured counts nowhere, or, in SSIM, as right; None: all was.
 """
 
 import numpy as np
@@ -67,10 +66,7 @@ def psnr(
     peak_kpa: float = PEAK_KPA,
     layout: TactileLayout = DEXTOUCH_V1,
 ) -> float:
-    """10 log10(peak² / MSE) in dB of the pooled MSE, at most 100 dB.
-
-    Pooled, since samples of an untouched hand are mostly exact: the cap would dominate a mean.
-    """
+    """10 log10(peak² / MSE) in dB, at most 100, of the pooled MSE, as most samples are exact."""
     a, b = _pair(predicted_kpa, true_kpa, "PSNR", measured, layout)
     return float(decibels(np.float64(_mean((a - b) ** 2, measured)), peak=peak_kpa))
 
@@ -114,10 +110,7 @@ def contact_mae(
     measured: Measured = None,
     layout: TactileLayout = DEXTOUCH_V1,
 ) -> float:
-    """Mean absolute error in kPa over the taxels in true contact.
-
-    NaN when no taxel is in true contact.
-    """
+    """Mean absolute error in kPa over the taxels in true contact; NaN if none is."""
     a, b = _pair(predicted_kpa, true_kpa, "contact MAE", measured, layout)
     touched = in_contact(b)
     return float(np.mean(np.abs(a - b)[touched])) if touched.any() else float("nan")
@@ -155,8 +148,7 @@ def pad_contact_f1(
 ) -> float:
     """F1 of pads in contact, six of each hand; 1 when neither side has contact.
 
-    A fingertip or palm is in contact if one of its taxels is. Where exactly skin is pressed does
-    not matter, which differs between people and robots.
+    A pad is in contact if one of its taxels is: where exactly skin is pressed does not matter.
     """
     a, b = _pair(predicted_kpa, true_kpa, "contact F1 of pads", measured, layout)
     touched_a, touched_b = (layout.by_part(in_contact(kpa), np.any) for kpa in (a, b))

@@ -1,7 +1,4 @@
-"""Agreement of trajectories by dynamic time warping, normalized to 0 … 1.
-
-Needed where motion may be right in shape but early or late, so that errors step by step mislead.
-"""
+"""Agreement of trajectories that may be early or late, by dynamic time warping, in 0 … 1."""
 
 import math
 
@@ -15,11 +12,7 @@ MIN_FOUND_SHARE = 0.1
 
 
 def dynamic_time_warping(first: np.ndarray, second: np.ndarray) -> float:
-    """Least sum of distances over monotone alignments of two trajectories [n, d] and [m, d].
-
-    Both ends are aligned, and every point of either has at least one partner (Sakoe and Chiba 1978,
-    steps of one in either or both).
-    """
+    """Least sum of distances over alignments of [n, d] and [m, d] (Sakoe and Chiba 1978)."""
     distances = np.linalg.norm(first[:, None] - second[None], axis=2)
     cost = np.full((len(first) + 1, len(second) + 1), np.inf)
     cost[0, 0] = 0.0

@@ -129,8 +129,6 @@ from .scene_objects import ObjectMarker as ObjectMarker
 from .scene_objects import SceneObject as SceneObject
 from .scene_objects import SceneObjects as SceneObjects
 from .scene_objects import TouchedAt as TouchedAt
-from .scene_objects import load_object_clicks as load_object_clicks
-from .scene_objects import load_scene_objects as load_scene_objects
 from .scene_objects import object_stream as object_stream
 from .station import KEY_NAME_PATTERN as KEY_NAME_PATTERN
 from .station import MAX_CHECKED_TAKES as MAX_CHECKED_TAKES

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, AwareDatetime, Field, StringConstraints, model_validator
 
 from dextouch.free_text import FreeLines, FreeText, check_lines
-from dextouch.frozen_model import FrozenModel, example
+from dextouch.frozen_model import FrozenModel, example, is_none
 from dextouch.schemas.common import MAX_INSTRUCTION, Domain, Origin, StoreId
 from dextouch.schemas.episodes import LineageEntry
 from dextouch.tactile import LayoutDescription
@@ -110,7 +110,7 @@ class Review(FrozenModel):
     reviewer: str | None = Field(default=None, max_length=128)
     reviewed_at: AwareDatetime
     superseded_by: tuple[StoreId, ...] = Field(default=(), max_length=MAX_MOVED, exclude_if=not_)
-    earlier: "Review | None" = Field(default=None, exclude_if=lambda review: review is None)
+    earlier: "Review | None" = Field(default=None, exclude_if=is_none)
 
     def standing(self, is_stored: Callable[[str], bool]) -> "Review | None":
         """The review that counts: the earlier one where no result of an edit is stored any more."""
@@ -412,7 +412,7 @@ class PlayedStream(FrozenModel):
     interpolated: tuple[InterpolatedSpan, ...] = ()
     unmeasured_taxels: tuple[int, ...] = ()
     components: tuple[str, ...] = ()
-    layout: LayoutDescription | None = Field(default=None, exclude_if=lambda layout: layout is None)
+    layout: LayoutDescription | None = Field(default=None, exclude_if=is_none)
 
 
 class Playback(_ItemFields):

@@ -7,7 +7,7 @@ from typing import Annotated, Literal, TypeVar
 from pydantic import Field, FiniteFloat, ValidationError, field_validator, model_validator
 
 from dextouch.errors import InvalidInputError, NotFoundError
-from dextouch.frozen_model import FrozenModel, example
+from dextouch.frozen_model import FrozenModel, example, is_none
 from dextouch.schemas.common import Box, StoreId, first_problems
 
 # Position x y z (m), then the quaternion w x y z.
@@ -124,7 +124,7 @@ class SceneObject(FrozenModel):
     fixed: bool = False
     click: ClickedAt = Field(default=ClickedAt(), exclude_if=lambda click: click == ClickedAt())
 
-    touch: TouchedAt | None = Field(default=None, exclude_if=lambda touch: touch is None)
+    touch: TouchedAt | None = Field(default=None, exclude_if=is_none)
 
     _tracker_is_turned = field_validator("tracker_pose")(
         lambda pose: None if pose is None else _is_turned(pose)
@@ -173,6 +173,9 @@ class SceneObject(FrozenModel):
         return self.touch is not None and self.touch.event == "grasp" and not self.fixed
 
 
+Objects = TypeVar("Objects", bound="SceneObjects")
+
+
 class SceneObjects(FrozenModel):
     """Objects of every task, in the order of the world model's slots.
 
@@ -214,6 +217,26 @@ class SceneObjects(FrozenModel):
                     f"{self.dictionary}"
                 )
         return self
+
+    @classmethod
+    def load(cls: type[Objects], path: Path) -> Objects:
+        """Read the objects, and of `ObjectClicks` also the clicks, of a JSON file.
+
+        Raises NotFoundError without the file, InvalidInputError if it is not JSON, too large, or
+        has other fields than expected.
+        """
+        if not path.is_file():
+            raise NotFoundError(f"objects: there is no file {path}; docs/objects.md shows one")
+        if (num_bytes := path.stat().st_size) > MAX_FILE_BYTES:
+            raise InvalidInputError(
+                f"objects {path}: got {num_bytes} bytes, expected at most {MAX_FILE_BYTES}"
+            )
+        try:
+            return cls.model_validate_json(path.read_bytes())
+        except ValidationError as error:
+            raise InvalidInputError(
+                f"objects {path}: {first_problems(error)}; docs/objects.md shows a file"
+            ) from error
 
     def of_task(self, task: str) -> "SceneObjects | None":
         """The objects of one task as streams measure them; None if the file does not have it.
@@ -270,39 +293,6 @@ class ObjectClicks(SceneObjects):
     episodes: dict[StoreId, EpisodeClicks] = Field(default={}, max_length=MAX_CLICKED)
 
 
-Objects = TypeVar("Objects", bound=SceneObjects)
-
-
 def object_stream(name: str) -> str:
     """Name of the stream of the pose T_world_object of an object."""
     return f"object_{name}"
-
-
-def load_scene_objects(path: Path) -> SceneObjects:
-    """Read the objects of a JSON file; raises as `load_object_clicks`."""
-    return _loaded(path, SceneObjects)
-
-
-def load_object_clicks(path: Path) -> ObjectClicks:
-    """Read objects, and clicks on them, of a JSON file.
-
-    Raises NotFoundError without the file, InvalidInputError if it is not JSON, too large, or has
-    other fields than expected.
-    """
-    return _loaded(path, ObjectClicks)
-
-
-def _loaded(path: Path, form: type[Objects]) -> Objects:
-    if not path.is_file():
-        raise NotFoundError(f"objects: there is no file {path}; docs/objects.md shows one")
-    if path.stat().st_size > MAX_FILE_BYTES:
-        raise InvalidInputError(
-            f"objects {path}: got {path.stat().st_size} bytes, expected at most {MAX_FILE_BYTES}"
-        )
-    try:
-        return form.model_validate_json(path.read_bytes())
-    except ValidationError as error:
-        problems = first_problems(error)
-        raise InvalidInputError(
-            f"objects {path}: {problems}; docs/objects.md shows a file"
-        ) from error

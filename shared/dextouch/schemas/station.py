@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 from pydantic import AwareDatetime, Field, FiniteFloat, SecretStr
 
 from dextouch.free_text import FreeText
-from dextouch.frozen_model import FrozenModel, example
+from dextouch.frozen_model import FrozenModel, example, is_none
 from dextouch.schemas.common import MAX_INSTRUCTION, Domain, StoreId
 from dextouch.tactile import LayoutDescription, LayoutText
 
@@ -227,7 +227,7 @@ class StreamHealth(FrozenModel):
     clock_residual_ms: float | None = None
     taxels: dict[TaxelState, tuple[int, ...]] = Field(default_factory=dict)
     tare_age_s: float | None = None
-    layout: LayoutDescription | None = Field(default=None, exclude_if=lambda layout: layout is None)
+    layout: LayoutDescription | None = Field(default=None, exclude_if=is_none)
     following: RobotFollowing | None = None
 
 
@@ -319,9 +319,7 @@ class StationHealth(FrozenModel):
     figures: dict[str, FiniteFloat] = Field(default_factory=dict)
     streams: tuple[StreamHealth, ...]
     devices: tuple[DeviceHealth, ...]
-    faults: tuple[SimulatedFault, ...] | None = Field(
-        default=None, exclude_if=lambda faults: faults is None
-    )
+    faults: tuple[SimulatedFault, ...] | None = Field(default=None, exclude_if=is_none)
 
 
 class StationOverview(FrozenModel):

@@ -41,6 +41,11 @@ MIN_BYTES_PER_S = 16 * 2**10
 MAX_HEADER_BYTES = 2**16
 # Bytes of a header's line beside its name and value: ": " and the end of the line.
 NUM_SEPARATORS = 4
+# Of unfinished messages of all WebSockets of a process together, beside those of 64 KiB: 16 of the
+# largest that a policy may send (`MAX_BODY_BYTES`), each of which takes well below a second.
+MAX_UNFINISHED_BYTES = 2**28
+# Larger ones count there.
+ORDINARY_MESSAGE_BYTES = 2**16
 # Clients that are told at the same time that there is no place; further ones are just closed.
 MAX_REFUSED = 64
 MAX_CHECK_PERIOD_S = 1.0
@@ -83,6 +88,8 @@ class _Limits:
     max_connections: int
     client_timeout_s: float
     idle: dict["_LimitedHttp", None] = field(default_factory=dict)
+    # Bytes of large unfinished messages, the first begun first.
+    unfinished: dict["_LimitedWebSocket", int] = field(default_factory=dict)
 
     # Made in the process that needs it: with several workers the limits are sent to each.
     @cached_property
@@ -149,7 +156,8 @@ class _Watched(asyncio.Protocol):
 class _LimitedWebSocket(_Watched, WebSocketsSansIOProtocol):
     """WebSocket whose client must read, and end each message that it begins.
 
-    uvicorn's pings find clients that are gone.
+    Where unfinished messages need too much memory together, the one begun first ends with its
+    connection (close code 1013, try again later). uvicorn's pings find clients that are gone.
     """
 
     def __init__(self, *, limits: _Limits, **given: Any) -> None:  # noqa: ANN401 - uvicorn's
@@ -166,6 +174,34 @@ class _LimitedWebSocket(_Watched, WebSocketsSansIOProtocol):
         if not self.transport.get_write_buffer_size():
             self._moved_bytes += max(0, unfinished - self._unfinished_bytes)
         self._unfinished_bytes = unfinished
+        self._limit_memory()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        super().connection_lost(exc)
+        self._limits.unfinished.pop(self, None)
+
+    def _limit_memory(self) -> None:
+        all_unfinished = self._limits.unfinished
+        if self._unfinished_bytes <= ORDINARY_MESSAGE_BYTES:
+            all_unfinished.pop(self, None)
+            return
+        all_unfinished[self] = self._unfinished_bytes
+        while sum(all_unfinished.values()) > MAX_UNFINISHED_BYTES:
+            first = next(iter(all_unfinished))
+            del all_unfinished[first]
+            first.close_for_memory()
+
+    def close_for_memory(self) -> None:
+        """End the connection and the message that it has begun."""
+        logger.warning("websocket_closed", reason="memory", num_bytes=self._unfinished_bytes)
+        self._begun, self.frames = bytearray(), []
+        if not self.close_sent:
+            reason = "unfinished messages of all clients need too much memory; try again later"
+            self.queue.put_nowait({"type": "websocket.disconnect", "code": 1013, "reason": reason})
+            self.conn.send_close(1013, reason)
+            self.transport.write(b"".join(self.conn.data_to_send()))
+            self.close_sent = True
+        self.transport.close()
 
     def handle_cont(self, event: Any) -> None:  # noqa: ANN401 - of websockets
         self._begun += b"".join([*self.frames, event.data])

@@ -1,8 +1,6 @@
 """OpenAPI document of a service, complete enough for generated clients and for a page of it.
 
-FastAPI documents parameters, models and successful responses. The rest follows from the routes:
-the name of the function is the operation id, `RequireScope` gives the security scheme, `takes` and
-`JsonBody` the request body, method and parameters the refusals.
+What FastAPI does not document follows from `RequireScope`, `takes`, `JsonBody` and the method.
 """
 
 from collections.abc import Iterator, Sequence

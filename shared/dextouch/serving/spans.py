@@ -18,7 +18,7 @@ from starlette.types import Scope
 
 from dextouch.installation import install_command
 from dextouch.serving.guard import header
-from dextouch.tracing import TraceContext, in_trace, new_trace, parse_traceparent
+from dextouch.tracing import TRACEPARENT, TraceContext, in_trace, new_trace, parse_traceparent
 
 if TYPE_CHECKING:
     from opentelemetry.sdk.trace import TracerProvider
@@ -80,17 +80,12 @@ class Spans:
     def of_request(self, scope: Scope, caller: TraceContext | None) -> Iterator[TraceContext]:
         """Span of a request below its caller's; needs a tracer."""
         from opentelemetry import trace
+        from opentelemetry.trace.propagation.tracecontext import TraceContextTextMapPropagator
 
         assert self.tracer is not None  # noqa: S101 - the caller looks
         above = None
         if caller is not None:
-            parent = trace.SpanContext(
-                int(caller.trace_id, 16),
-                int(caller.span_id, 16),
-                is_remote=True,
-                trace_flags=trace.TraceFlags(int(caller.flags, 16)),
-            )
-            above = trace.set_span_in_context(trace.NonRecordingSpan(parent))
+            above = TraceContextTextMapPropagator().extract({TRACEPARENT: caller.header})
         with self.tracer.start_as_current_span(
             scope["method"], context=above, kind=trace.SpanKind.SERVER
         ) as span:

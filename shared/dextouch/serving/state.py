@@ -193,9 +193,7 @@ end
 
 # KEYS[1] key · ARGV: expected version, value, tail, time to live in ms, note
 # → {1, new} or {0, stored}
-COMPARE_AND_SET = (
-    _SCRIPT_COMMON
-    + """
+COMPARE_AND_SET = """
 local stored = redis.call('HMGET', KEYS[1], 'version', 'groups')
 local version = tonumber(stored[1] or '0')
 if version ~= tonumber(ARGV[1]) then return {0, version} end
@@ -217,13 +215,10 @@ for _, group in ipairs(stored[2] and cmsgpack.unpack(stored[2]) or {}) do
 end
 return {1, version + 1}
 """
-)
 
 # KEYS[1] key · ARGV: value, time to live in ms, then pairs of a group and its limit
 # → -1: stored already, 0: no room, 1: written
-ADD = (
-    _SCRIPT_COMMON
-    + """
+ADD = """
 if redis.call('EXISTS', KEYS[1]) == 1 then return -1 end
 local groups = {}
 for i = 3, #ARGV, 2 do
@@ -241,22 +236,16 @@ for _, group in ipairs(groups) do
 end
 return 1
 """
-)
 
 # KEYS[1] key → 1: deleted, 0: absent
-DELETE = (
-    _SCRIPT_COMMON
-    + """
+DELETE = """
 local groups = redis.call('HGET', KEYS[1], 'groups')
 for _, group in ipairs(groups and cmsgpack.unpack(groups) or {}) do forget(group, {KEYS[1]}) end
 return redis.call('DEL', KEYS[1])
 """
-)
 
 # ARGV: group, limit → how many keys have a note, then notes, the newest first
-NEWEST_NOTES = (
-    _SCRIPT_COMMON
-    + """
+NEWEST_NOTES = """
 forget_expired(ARGV[1])
 local _, noted = indexes(ARGV[1])
 local found = {redis.call('ZCARD', noted)}
@@ -265,7 +254,6 @@ for _, key in ipairs(redis.call('ZREVRANGE', noted, 0, ARGV[2] - 1)) do
 end
 return found
 """
-)
 
 
 class RedisState:
@@ -286,10 +274,10 @@ class RedisState:
             raise InvalidInputError(f"redis address: {error}") from error
         # Credentials in the URL are kept out of messages.
         self._where = url.rsplit("@", 1)[-1]
-        self._compare_and_set = self._client.register_script(COMPARE_AND_SET)
-        self._add = self._client.register_script(ADD)
-        self._delete = self._client.register_script(DELETE)
-        self._newest_notes = self._client.register_script(NEWEST_NOTES)
+        self._compare_and_set = self._client.register_script(_SCRIPT_COMMON + COMPARE_AND_SET)
+        self._add = self._client.register_script(_SCRIPT_COMMON + ADD)
+        self._delete = self._client.register_script(_SCRIPT_COMMON + DELETE)
+        self._newest_notes = self._client.register_script(_SCRIPT_COMMON + NEWEST_NOTES)
 
     async def get(self, key: str) -> Versioned | None:
         """See MemoryState."""

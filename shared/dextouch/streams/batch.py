@@ -1,9 +1,7 @@
 """A batch of samples as bytes, the same in a spool's log, on the wire and in the store's upload.
 
-The body of a batch is its samples end to end, so that bodies end to end are a body, too. A sample
-is t_host_ns, t_device_ns and sequence as int64, then its values, or of an encoded image its length
-as u32 and its bytes. On the wire a header comes first. All numbers are little endian. See
-docs/wire_format.md.
+A body is samples end to end: t_host_ns, t_device_ns and sequence as int64, then the values, or the
+length (u32) and bytes of an encoded image; little endian. See docs/wire_format.md.
 """
 
 import struct
@@ -146,10 +144,7 @@ def encode_batch(descriptor: StreamDescriptor, batch: SampleBatch, *, number: in
 
 
 def frame_body(stream_name: str, body: bytes, num_samples: int, *, number: int) -> bytes:
-    """Put the header of the wire before a body, for example of a spool; raises as `encode_batch`.
-
-    The body is not looked at: the store checks it.
-    """
+    """Put the wire's header before a body, which the store checks; raises as `encode_batch`."""
     _check_count(stream_name, num_samples)
     if not 0 <= number < 1 << 32:
         raise InvalidInputError(f"{stream_name}: got batch number {number}, expected 0 … 2^32 - 1")

@@ -1,8 +1,4 @@
-"""Checks whether poses of a head and two wrists can be those of one body.
-
-A single stream does not show feet for metres, mirrored axes or exchanged trackers; head and hands
-together do. Stations apply the checks to the last seconds, alignment to whole recordings.
-"""
+"""Checks whether poses of a head and two wrists can be those of one body, live or recorded."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -170,10 +166,7 @@ class _Bodies:
         return float((sees & (head[:, 2, 1] < -np.cos(MAX_VIEW_RAD))).mean())
 
     def crossed(self) -> float:
-        """By how much (m) the left wrist is right of the right one all the time; 0 if it is not.
-
-        x of the head points to the right.
-        """
+        """How far (m) the left wrist always is right, by the head's x, of the other; or 0."""
         apart_m = self.at_m(WRISTS[0]) - self.at_m(WRISTS[1])
         aside_m = (apart_m * self.transforms("head")[:, :3, 0]).sum(axis=1)
         always = float((aside_m > MIN_ASIDE_M).mean()) >= ALWAYS_SHARE
@@ -254,7 +247,6 @@ def _check_wrists(bodies: _Bodies) -> ImplausibleBody | None:
 
 
 def _check_reach(bodies: _Bodies) -> ImplausibleBody | None:
-    """A person's wrists are within reach of the head, but not in the same place."""
     apart_m = {name: bodies.apart_m(name, "head") for name in WRISTS}
     hands_m = bodies.apart_m(*WRISTS)
     near = min(*apart_m.values(), hands_m)
@@ -285,7 +277,6 @@ def _check_reach(bodies: _Bodies) -> ImplausibleBody | None:
 
 
 def _check_sides(bodies: _Bodies) -> ImplausibleBody | None:
-    """Hands cross now and then, hardly all the time."""
     if bodies.upright() < RIGHT_SHARE or not (aside_m := bodies.crossed()):
         return None
     text = (

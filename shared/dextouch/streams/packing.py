@@ -34,10 +34,7 @@ C = TypeVar("C", bound=Sized)
 
 
 def pack(fields: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> bytes:
-    """Serialize JSON-like fields and arrays (little endian, C order).
-
-    Raises InvalidInputError for an unsupported dtype, or an integer beyond 64 bits.
-    """
+    """Serialize JSON-like fields and arrays (little endian, C order); raises InvalidInputError."""
     packed = {}
     for name, array in arrays.items():
         ordered = np.ascontiguousarray(array)
@@ -148,10 +145,7 @@ def array_of(
 
 
 def pack_openpi(message: Mapping[str, Any]) -> bytes:
-    """Serialize nested maps and lists of plain values and arrays.
-
-    Raises InvalidInputError for a value that msgpack does not hold.
-    """
+    """Serialize nested maps and lists of plain values and arrays; raises InvalidInputError."""
     try:
         return msgpack.packb(dict(message), default=_encoded)
     except (TypeError, OverflowError) as error:

@@ -1,8 +1,6 @@
 """Checks whether values of a stream can be true: units, speeds, limits, frozen and repeated values.
 
-Stations apply them to what devices send now, alignment to whole recordings. What is wrong with
-single samples is located, so that they can be left out; what is wrong with all of them (another
-unit, for example) is named with the values that were found.
+Stations apply them to what devices send now, alignment to whole recordings.
 """
 
 from collections.abc import Iterator
@@ -81,9 +79,8 @@ def implausible_values(
 ) -> list[Implausible]:
     """What is implausible in samples [n, …] of a stream of poses, joints or keypoints.
 
-    What is commanded may leap, may be kept, and may lie beyond limits to press: only its unit is
-    checked. What is `of_robot` may rest exactly; joints and poses in a robot's base always may.
-    Times increase.
+    Times increase. Only the unit is checked of what is commanded. What is `of_robot` may rest
+    exactly; joints and poses in a robot's base always may.
     """
     if descriptor.kind == "pose":
         can_rest = of_robot or descriptor.frame == "base"
@@ -93,7 +90,7 @@ def implausible_values(
         # Gloves whose sensors are coarse rest, too.
         found = list(implausible_repeats(values, what="keypoints", may_lock=True))
         if values.shape[1:] == (NUM_KEYPOINTS, 3):
-            found += _standing_nodes(values, found)
+            found += _frozen_nodes(values, found)
     elif descriptor.kind == "robot_state" and descriptor.unit == "rad":
         lower_rad, upper_rad = _limits_rad()
         if values.shape[1:] != lower_rad.shape:
@@ -152,7 +149,7 @@ def implausible_poses(
     follows = np.diff(seen_ns) < 1.5 * period_ns
     repeats = list(implausible_repeats(seen, can_rest=can_rest, follows=follows))
     if not can_rest:
-        repeats += _standing(seen, repeats)
+        repeats += _frozen_axes(seen, repeats)
     found += [replace(one, samples=spread(one.samples, known, len(values))) for one in repeats]
     new = known[~np.any([one.samples[known] for one in found], axis=0)] if found else known
     jumps = spread(_outliers(np.asarray(t_ns)[new], values[new], period_ns), new, len(values))
@@ -188,7 +185,7 @@ def _implausible_size(
     return None
 
 
-def _standing_nodes(keypoints: np.ndarray, repeats: list[Implausible]) -> Iterator[Implausible]:
+def _frozen_nodes(keypoints: np.ndarray, repeats: list[Implausible]) -> Iterator[Implausible]:
     """Fingers that repeat what they were, and nodes that stand still though they are noisy."""
     moved, rested = np.zeros((2, *keypoints.shape[:2]), dtype=bool)
     for chain in CHAINS:
@@ -209,7 +206,7 @@ def _standing_nodes(keypoints: np.ndarray, repeats: list[Implausible]) -> Iterat
             )
 
 
-def _standing(poses: np.ndarray, repeats: list[Implausible]) -> Iterator[Implausible]:
+def _frozen_axes(poses: np.ndarray, repeats: list[Implausible]) -> Iterator[Implausible]:
     """One axis or the rotation stands still while the others move, or all of it does nearly."""
     flips = (poses[1:, 3:] * poses[:-1, 3:]).sum(axis=1) < 0
     turns = poses[:, 3:] * np.cumprod(np.append(1, 1 - 2 * flips))[:, None]
@@ -245,10 +242,7 @@ def _extent(poses: np.ndarray) -> tuple[float, float]:
 def lasting_jumps(
     t_ns: Int64[np.ndarray, " n"], poses: np.ndarray, *, period_ns: int
 ) -> Int64[np.ndarray, " jumps"]:
-    """Numbers of the samples from which on a tracker's world is another: it found itself anew.
-
-    Poses [n, 7] were all seen, at increasing times, and are without outliers.
-    """
+    """Samples from which on a tracker's world is another, of poses [n, 7] without outliers."""
     if len(poses) < 2:
         return np.zeros(0, dtype=np.int64)
     return np.flatnonzero(_leaps(t_ns, np.asarray(poses, dtype=np.float64), period_ns)) + 1
@@ -331,10 +325,7 @@ def _unit(distance_m: float, speed_m_s: float | None) -> str | None:
 
 
 def _leaps(t_ns: np.ndarray, poses: np.ndarray, period_ns: int) -> Bool[np.ndarray, " steps"]:
-    """Steps that are too fast, or further than those before and after lead at any acceleration.
-
-    A hand that hits something goes on at the speed before, the one after, or one between.
-    """
+    """Steps that are too fast, or further than those beside lead at any acceleration."""
     leaps = _is_fast(*_speeds(t_ns, poses, period_ns))
     if len(poses) < MIN_STEPS:
         return leaps

@@ -145,8 +145,7 @@ def implausible_repeats(
 def _held(equal: np.ndarray) -> tuple[Bool[np.ndarray, " n"], float]:
     """Samples that only repeat a value which is held for a number of samples, and this number.
 
-    A device that is at rest as well repeats its value for longer: of that, samples at that distance
-    remain.
+    Of a longer rest, samples at that distance remain.
     """
     none = np.zeros(len(equal) + 1, dtype=bool)
     begins = np.concatenate([[0], np.flatnonzero(~equal) + 1])
@@ -204,9 +203,7 @@ def _runs(marked: np.ndarray, least: int) -> list[tuple[int, int]]:
 def still_parts(
     parts: Float64[np.ndarray, "n parts size"],
 ) -> list[tuple[int, Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]]:
-    """Parts of noisy values that stand still, such as one axis or finger, exactly or nearly.
-
-    Consecutive samples; NaN is no value.
+    """Parts of noisy consecutive values, such as one axis or finger, that stand still, or nearly.
 
     Returns:
         Part, samples in which it stands still though it moved (it ends elsewhere, or not at all),
@@ -223,7 +220,7 @@ def still_parts(
         still, harmless = np.zeros((2, len(parts)), dtype=bool)
         for start, stop in _runs(lengths[:, part] < STILL_SHARE * noise[part], MIN_STILL_STEPS):
             goes_on = stop + 1 < len(parts) and (
-                _apart(parts[stop, part], parts[stop + 1, part]) <= MIN_CATCH_UP
+                _distance(parts[stop, part], parts[stop + 1, part]) <= MIN_CATCH_UP
             )
             # What is rounded rests exactly, and goes on where it was.
             if not goes_on or (lengths[start:stop, part] > rounding).any():
@@ -236,10 +233,7 @@ def still_parts(
 def _noise_of(
     steps: Float64[np.ndarray, "n parts size"], rounding: float
 ) -> Float64[np.ndarray, " parts"]:
-    """Usual length of second differences where a part is least noisy; 0 of parts without noise.
-
-    Rounded values may rest: they have none, either.
-    """
+    """Usual length of second differences where a part is least noisy; 0 of rounded values."""
     bends = np.diff(steps, axis=0)
     lengths = np.linalg.norm(bends, axis=-1)
     num_blocks, num_parts = len(bends) // NOISE_BLOCK, steps.shape[1]
@@ -276,10 +270,7 @@ def _rests(equal: Bool[np.ndarray, " n"]) -> bool:
 def _frozen(
     rows: np.ndarray, is_next: np.ndarray, *, is_noisy: bool | None, may_lock: bool
 ) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
-    """Rows that repeat the one before for long: where the device moved, and where it rested.
-
-    At rest, only devices that are noisy otherwise are meant.
-    """
+    """Rows that repeat the one before for long: where the device moved, and where noise rests."""
     frozen, harmless = np.zeros((2, len(rows)), dtype=bool)
     equal = (rows[1:] == rows[:-1]).all(axis=1)
     long = _runs(equal, MIN_FROZEN_STEPS)
@@ -290,7 +281,7 @@ def _frozen(
     for start, stop in long:
         kept = slice(start + 1, stop + 1)
         # What goes on where it was has lost nothing; of what ends so, nobody knows.
-        is_off = stop + 1 == len(rows) or _apart(rows[stop], rows[stop + 1]) > MIN_CATCH_UP
+        is_off = stop + 1 == len(rows) or _distance(rows[stop], rows[stop + 1]) > MIN_CATCH_UP
         is_lost = is_noisy and is_off and not may_lock
         frozen[kept] = is_lost or _catches_up(rows, is_next, start, stop)
         harmless[kept] = is_noisy and not frozen[stop]
@@ -325,7 +316,7 @@ def _is_noisy(rows: np.ndarray, equal: np.ndarray) -> bool:
     return len(cosines) >= MIN_STEPS / 3 and bool(np.median(cosines) < MAX_NOISE_COSINE)
 
 
-def _apart(some: np.ndarray, other: np.ndarray) -> float:
+def _distance(some: np.ndarray, other: np.ndarray) -> float:
     return float(np.linalg.norm(other.astype(np.float64) - some))
 
 

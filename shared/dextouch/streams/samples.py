@@ -260,10 +260,7 @@ RESIDUAL_SHARES: Final = (0.25, 0.5)
 
 
 def residual_limits_s(counted_period_s: float | None) -> tuple[float, float]:
-    """From where on the scatter of arrivals is a warning and an error.
-
-    `counted_period_s` is that of a stream that is dated by counting its samples; None of others.
-    """
+    """Scatter of arrivals that is a warning and an error; of counted streams by their period."""
     warn_s, error_s = RESIDUAL_WARN_S, RESIDUAL_ERROR_S
     if counted_period_s is None:
         return warn_s, error_s

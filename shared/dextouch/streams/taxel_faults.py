@@ -1,7 +1,4 @@
-"""Finds taxels whose readings cannot be true, and samples that a glove repeats.
-
-Stations apply it to the last seconds, alignment to whole takes.
-"""
+"""Finds taxels whose readings cannot be true, and samples that a glove repeats."""
 
 from typing import Final
 
@@ -51,20 +48,14 @@ def neighbour_share(
     layout: TactileLayout = DEXTOUCH_V1,
     exists: Bool[np.ndarray, " taxels"] | None = None,
 ) -> Float64[np.ndarray, " taxels"]:
-    """Share of the up to 8 neighbours on its pad that moved, for each taxel.
-
-    Only taxels that exist are neighbours; by default all do.
-    """
+    """Share of each taxel's up to 8 neighbours, of those that exist, on its pad that moved."""
     others = np.ones_like(moved) if exists is None else exists
     stacks = zip(layout.split(moved), layout.split(others), strict=True)
     return layout.join([share_around(*stack) for stack in stacks])
 
 
 def share_around(moved: np.ndarray, exists: np.ndarray) -> np.ndarray:
-    """Share of the up to 8 existing neighbours that moved, of each cell [..., rows, columns].
-
-    A cell that moved exists.
-    """
+    """Share of the existing neighbours that moved, of each cell [..., rows, columns]."""
     edges = [(0, 0)] * (moved.ndim - 2) + [(1, 1), (1, 1)]
     padded = np.pad(np.stack([moved, exists]).astype(np.float64), [(0, 0), *edges])
     blocks = np.lib.stride_tricks.sliding_window_view(padded, (3, 3), axis=(-2, -1))
@@ -229,10 +220,7 @@ class TaxelFaults:
         }
 
     def _ended(self) -> Bool[np.ndarray, " taxels"]:
-        """Taxels that keep a reading to the end which no pressure gives, or that lost their noise.
-
-        A stream that is frozen as a whole, and readings at full scale, are none of these.
-        """
+        """Taxels that keep a reading to the end which no pressure gives, or lost their noise."""
         last = np.concatenate(self._keys[-2:])[-2:]
         if len(last) == 2 and last[0] == last[1]:
             return np.zeros(len(self._last), dtype=bool)

@@ -10,7 +10,5 @@ from .layout import CONTACT_THRESHOLD_KPA as CONTACT_THRESHOLD_KPA
 from .layout import DEXTOUCH_V1 as DEXTOUCH_V1
 from .layout import TactileLayout as TactileLayout
 from .layout import colour as colour
-from .layout import hand_canvas as hand_canvas
 from .layout import in_contact as in_contact
-from .layout import pad_forces_n as pad_forces_n
 from .layout import read_layout as read_layout

@@ -1,8 +1,4 @@
-"""Description of a tactile glove: its pads, its wiring, and what its readings mean.
-
-Plain data without arrays, so that schemas and parsers can hold it; `dextouch.tactile.layout` has
-the operations on readings.
-"""
+"""Description of a tactile glove, without arrays: its pads, its wiring, what its readings mean."""
 
 import hashlib
 import itertools

@@ -2,11 +2,7 @@
 
 Anatomical order of the taxels, the same for both hands: pad by pad, the fingers from the thumb to
 the little one, then the palm. Inside every pad axis 0 runs from distal to proximal and axis 1 from
-radial (thumb side) to ulnar, so that a left and a right hand doing the same thing give the same
-numbers.
-
-How many taxels there are, and where, is a fact of the glove: a `TactileLayout`. `DEXTOUCH_V1` is
-that of streams and episodes that name no other; `read_layout` reads another one from a file.
+radial (thumb side) to ulnar. `DEXTOUCH_V1` is that of streams and episodes that name no other.
 """
 
 from collections.abc import Callable, Sequence
@@ -18,15 +14,9 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 from pydantic import ValidationError
 
-from dextouch.errors import (
-    InvalidInputError,
-    LimitExceededError,
-    NonFiniteError,
-    NotFoundError,
-    ShapeError,
-    StorageError,
-    UnknownNameError,
-)
+from dextouch.data_folder import read_bounded
+from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError, UnknownNameError
+from dextouch.frozen_model import first_problem
 from dextouch.tactile.description import (
     KPA_PER_UNIT,
     NEWTON,
@@ -62,10 +52,7 @@ _EMPTY = np.array((247, 247, 245), dtype=np.uint8)
 
 
 class TactileLayout(LayoutDescription):
-    """Layout of a tactile glove, with what it means for arrays of readings.
-
-    Taxels are those of one hand in anatomical order, the last axis of arrays.
-    """
+    """Layout of a tactile glove for arrays whose last axis are taxels in anatomical order."""
 
     @classmethod
     def of(cls, description: LayoutDescription | None) -> "TactileLayout | None":
@@ -80,10 +67,7 @@ class TactileLayout(LayoutDescription):
 
     @cached_property
     def nominal_kpa_per_unit(self) -> Float64[np.ndarray, " taxels"] | None:
-        """Pressure of one unit of each taxel's reading; None where only calibration knows it.
-
-        Read-only.
-        """
+        """Pressure of a unit of each taxel, None if only calibration knows it; read-only."""
         if self.unit == NEWTON:
             return _read_only(1.0 / (_PASCAL_PER_KPA * self.areas_m2))
         scale = KPA_PER_UNIT.get(self.unit, self.kpa_per_unit)
@@ -241,11 +225,10 @@ def _read_only(array: np.ndarray) -> np.ndarray:
 
 
 def _dextouch_v1() -> TactileLayout:
-    """Layout of our own glove.
+    """Layout of our own glove, which scans 18 rows × 20 columns.
 
-    It scans 18 rows × 20 columns. Rows 0–3 hold the five fingertips side by side, rows 4–15 the
-    palm row by row, rows 16–17 are unused (40 cells). The left glove is wired as the mirror image:
-    its columns run the other way.
+    Rows 0–3 hold the five fingertips side by side, rows 4–15 the palm, rows 16–17 are unused. The
+    left glove is wired as the mirror image: its columns run the other way.
     """
     scan = np.arange(NUM_RAW_TAXELS).reshape(_SCAN_SHAPE)
 
@@ -300,30 +283,11 @@ def read_layout(path: Path | str) -> TactileLayout:
             holds and what was expected.
     """
     path = Path(path)
-    try:
-        with path.open("rb") as file:
-            data = file.read(MAX_LAYOUT_BYTES + 1)
-    except FileNotFoundError as error:
-        raise NotFoundError(f"layout {path}: no such file") from error
-    except OSError as error:
-        raise StorageError(f"layout {path}: cannot be read: {error.strerror}") from error
-    if len(data) > MAX_LAYOUT_BYTES:
-        raise LimitExceededError(
-            f"layout {path}: got more than {MAX_LAYOUT_BYTES} bytes, expected at most that"
-        )
+    data = read_bounded(path, MAX_LAYOUT_BYTES)
     try:
         return TactileLayout.model_validate_json(data.removeprefix(b"\xef\xbb\xbf"))
     except ValidationError as error:
-        problem = error.errors(include_url=False)[0]
-        where = ".".join(map(str, problem["loc"]))
-        message = problem["msg"].removeprefix("Value error, ")
-        if problem["type"] == "missing":
-            message = "got nothing, expected a value"
-        elif problem["type"] != "value_error":
-            message = f"got {problem['input']!r:.80}, expected: {message}"
-        raise InvalidInputError(
-            f"layout {path}: {where}{': ' if where else ''}{message}"
-        ) from error
+        raise InvalidInputError(f"layout {path}: {first_problem(error)}") from error
 
 
 def common_layout(layouts: Sequence[TactileLayout], *, what: str) -> TactileLayout:
@@ -352,17 +316,7 @@ def described(layouts: Sequence[TactileLayout]) -> str:
     )
 
 
-# The same of `dextouch_v1`.
-
-
-def taxel_areas_m2() -> np.ndarray:
-    """Sensing area of each of the 320 taxels in m² (force = pressure × area); read-only."""
-    return DEXTOUCH_V1.areas_m2
-
-
-def raw_indices(*, side: Side, glove_model: str = _V1_NAME) -> Int64[np.ndarray, "320"]:
-    """Raw cell of each taxel; read-only."""
-    return _layout_named(glove_model).raw_indices(side)
+# The promised functions of `dextouch_v1`.
 
 
 def select_taxels(raw: np.ndarray, *, side: Side, glove_model: str = _V1_NAME) -> np.ndarray:
@@ -401,16 +355,6 @@ def join_pads(fingertips: np.ndarray, palm: np.ndarray) -> np.ndarray:
     if palm.shape[-2:] != PALM_SHAPE:
         raise ShapeError(f"palm: got shape {palm.shape}, expected [..., 15, 16]")
     return DEXTOUCH_V1.join([np.asarray(fingertips), palm[..., None, :, :]])
-
-
-def pad_forces_n(tactile_kpa: np.ndarray) -> Float64[np.ndarray, "time 6"]:
-    """Normal forces of `TactileLayout.pad_forces_n` for taxels [T, 320]."""
-    return DEXTOUCH_V1.pad_forces_n(tactile_kpa)
-
-
-def hand_canvas(taxels: np.ndarray, *, side: Side) -> Float32[np.ndarray, "28 26"]:
-    """Taxels [320] laid out as a hand on a 28×26 grid; cells without a taxel are NaN."""
-    return DEXTOUCH_V1.hand_canvas(taxels, side=side)
 
 
 def _layout_named(glove_model: str) -> TactileLayout:

@@ -1,15 +1,6 @@
 """Rollouts over a WebSocket in openpi's message format, for openpi's clients and for low latency.
 
-The server first sends what it serves. Then every message of the client has one of these forms, and
-is answered with a map, or with text that says why it was refused (docs/rollout_api.md):
-
-- {"start": {"world", "task", "seed", "instruction"}}: begin a rollout; from an observation with
-  {"first_step", "reached_is_measured"} as "observation" and its arrays beside it
-- {"resume": ID}: continue a rollout that was begun here or over HTTP
-- {"actions": [K, 67]}: advance; with "chunk": N as the route of chunks, so that it may be repeated
-- {"end": true}: end the rollout
-
-"return": {"steps", "cameras", "tactile"} beside them selects what later answers hold.
+docs/rollout_api.md has the messages; those that are refused are answered with text.
 """
 
 from collections.abc import Sequence

@@ -50,7 +50,6 @@ from dextouch.worlds.records import (
     selector_bytes,
 )
 from dextouch.worlds.settings import RolloutLimits
-from dextouch.worlds.warm_up import first_chunk_s
 from dextouch.worlds.world import (
     StartedRollout,
     World,
@@ -59,6 +58,7 @@ from dextouch.worlds.world import (
     check_chunk,
     check_selector,
     check_start,
+    first_chunk_s,
 )
 
 logger = structlog.get_logger(__name__)

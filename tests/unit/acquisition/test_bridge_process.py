@@ -18,7 +18,7 @@ from services.acquisition.mock_bridge import BridgeServer, pattern_source
 from services.acquisition.mocks.faults import DeviceFaults
 from services.acquisition.mocks.pattern import pattern_streams
 from services.acquisition.mocks.replay import MockSlot
-from services.acquisition.mocks.trackers import bridged_pair
+from services.acquisition.mocks.trackers_and_cameras import bridged_pair
 from services.acquisition.settings import AcquisitionSettings
 
 # The promises are tried by `make slow`; the default run must not need an idle machine.

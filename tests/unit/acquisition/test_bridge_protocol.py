@@ -25,7 +25,7 @@ from services.acquisition.drivers.sdk_link import (
 )
 from services.acquisition.mocks.faults import DeviceFaults
 from services.acquisition.mocks.replay import ReplayStream
-from services.acquisition.mocks.trackers import BridgePoseSource
+from services.acquisition.mocks.trackers_and_cameras import BridgePoseSource
 
 MAGIC = b"DXFT"
 MS = 1_000_000

@@ -30,7 +30,7 @@ from services.acquisition.drivers.packets import SOURCES, VERSION, Packet, encod
 from services.acquisition.drivers.sdk_link import BridgeDriver, FrameConvention
 from services.acquisition.mocks.faults import DeviceFaults
 from services.acquisition.mocks.pattern import pattern_streams
-from services.acquisition.mocks.trackers import (
+from services.acquisition.mocks.trackers_and_cameras import (
     LEFT_HANDED,
     POSE_INDEX,
     Y_UP,

@@ -17,9 +17,9 @@ from services.acquisition.devices.camera import (
 from services.acquisition.drivers.base import Driver
 from services.acquisition.drivers.images import ImageEncoder
 from services.acquisition.drivers.packets import Packet, encode_packet
-from services.acquisition.mocks.cameras_and_robot import CameraSource
 from services.acquisition.mocks.ports import SocketPort
 from services.acquisition.mocks.replay import ReplayStream
+from services.acquisition.mocks.trackers_and_cameras import CameraSource
 from services.acquisition.settings import AcquisitionSettings
 
 PERIOD_NS = 33_333_333

@@ -22,7 +22,7 @@ from services.acquisition.devices.finger_tracker import (
 )
 from services.acquisition.mocks.ports import HidPort
 from services.acquisition.mocks.replay import ReplayStream
-from services.acquisition.mocks.trackers import FingerTrackerSource
+from services.acquisition.mocks.trackers_and_cameras import FingerTrackerSource
 
 ORDERS = st.permutations(range(NUM_KEYPOINTS))
 

@@ -10,10 +10,10 @@ from dextouch.errors import InvalidInputError
 from dextouch.schemas import TakePrompt
 from dextouch.streams import Sample, StreamDescriptor
 from services.acquisition.clock import StationClock, VirtualClock
-from services.acquisition.follow_watch import FollowCounts, FollowWatch
 from services.acquisition.mock_station import MockStation
 from services.acquisition.mocks.faults import FaultScript
 from services.acquisition.mocks.pattern import pattern_streams
+from services.acquisition.watches import FollowCounts, FollowWatch
 
 MS = 1_000_000
 PROMPT = TakePrompt(task="stand_bottle", instruction="stand the bottle up")

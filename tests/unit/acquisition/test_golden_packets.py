@@ -7,11 +7,15 @@ import pytest
 
 from dextouch.streams import StreamDescriptor
 from services.acquisition.devices.robot_state import STREAM_SIZES
-from services.acquisition.mocks.cameras_and_robot import CameraSource, RobotStateSource
 from services.acquisition.mocks.faults import DeviceFaults
 from services.acquisition.mocks.gloves import GloveCalibration, TactileGloveSource
 from services.acquisition.mocks.replay import ReplayStream
-from services.acquisition.mocks.trackers import FingerTrackerSource, PoseTrackerSource
+from services.acquisition.mocks.trackers_and_cameras import (
+    CameraSource,
+    FingerTrackerSource,
+    PoseTrackerSource,
+    RobotStateSource,
+)
 
 FLAT = GloveCalibration(np.full(360, 120.0), np.full(360, 40.0))
 

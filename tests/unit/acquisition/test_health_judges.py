@@ -4,13 +4,12 @@ import numpy as np
 import pytest
 
 from dextouch.streams import Sample, StreamDescriptor
-from dextouch.tactile.layout import expand_taxels, raw_indices
+from dextouch.tactile.layout import DEXTOUCH_V1, expand_taxels
 from services.acquisition.clock import VirtualClock
 from services.acquisition.devices.pose_tracker import PoseTrackerDecoder, pose_descriptor
 from services.acquisition.drivers.base import Driver
 from services.acquisition.drivers.images import ImageQuality
-from services.acquisition.glove_record import GloveRecord
-from services.acquisition.health.cells import TaxelCheck, count_taxels, neighbour_share
+from services.acquisition.health.cells import GloveRecord, TaxelCheck, count_taxels, neighbour_share
 from services.acquisition.health.streams import (
     BodiesCheck,
     CameraCheck,
@@ -33,7 +32,7 @@ class Hand:
 
     def __init__(self, *, drift_counts=0.0, pressed=True, tare=TARE):
         full = np.full(360, 1.0)
-        cells = raw_indices(side="left")
+        cells = DEXTOUCH_V1.raw_indices(side="left")
         self.judge = TaxelCheck(GloveRecord(full * tare, full * GAIN, full * 0.0, cells))
         self.drift_counts, self.pressed = drift_counts, pressed
         self.tare = tare

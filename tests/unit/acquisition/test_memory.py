@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from services.acquisition.memory import give_back_free_memory, keep_for_life
+from services.acquisition.recorder import give_back_free_memory, keep_for_life
 
 
 def resident_bytes():
@@ -74,7 +74,7 @@ def test_what_exists_at_the_start_is_not_looked_through_again(no_collector):
 SMALL_ARRAYS = """
 import ctypes
 import numpy as np
-from services.acquisition.memory import keep_for_life
+from services.acquisition.recorder import keep_for_life
 
 FIELDS = "arena ordblks smblks hblks hblkhd usmblks fsmblks uordblks fordblks keepcost".split()
 

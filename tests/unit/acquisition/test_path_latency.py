@@ -17,9 +17,9 @@ from services.acquisition.health.metrics import HealthCollector
 from services.acquisition.health.monitor import HealthMonitor
 from services.acquisition.health.station import PathCheck
 from services.acquisition.mocks.ports import PtyPort
-from services.acquisition.path_latency import MAX_BACK_OFF, PathWatch, add_latencies
 from services.acquisition.recorder import Recorder
 from services.acquisition.supervisor import DeviceSupervisor
+from services.acquisition.watches import MAX_BACK_OFF, PathWatch, add_latencies
 from tests.unit.acquisition.health_blocks_made import block, judged
 
 SECOND_NS = 1_000_000_000

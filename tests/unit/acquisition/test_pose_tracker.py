@@ -19,7 +19,7 @@ from services.acquisition.devices.pose_tracker import (
 )
 from services.acquisition.mocks.faults import DeviceFaults, FaultScript
 from services.acquisition.mocks.replay import ReplayStream
-from services.acquisition.mocks.trackers import PoseTrackerSource
+from services.acquisition.mocks.trackers_and_cameras import PoseTrackerSource
 
 PERIOD_NS = 10_000_000
 BOOT_NS = 10_000_000_000_000

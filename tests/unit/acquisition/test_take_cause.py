@@ -1,7 +1,7 @@
 """The root cause of an ended take: one sentence, one advice, for its gravest problem."""
 
 from dextouch.schemas import HealthCause, TakeProblem
-from services.acquisition.take_check import root_cause
+from services.acquisition.take import root_cause
 
 HUB = HealthCause(
     code="hub",

@@ -11,7 +11,7 @@ from dextouch.schemas import (
     TakeProblem,
 )
 from services.acquisition.health.monitor import HealthMonitor
-from services.acquisition.take_check import TakeFindings
+from services.acquisition.take import TakeFindings
 
 START_NS = 10**10
 

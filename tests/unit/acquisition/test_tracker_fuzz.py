@@ -18,7 +18,7 @@ from services.acquisition.devices.pose_tracker import (
 )
 from services.acquisition.mocks.faults import DeviceFaults
 from services.acquisition.mocks.pattern import pattern_streams
-from services.acquisition.mocks.trackers import (
+from services.acquisition.mocks.trackers_and_cameras import (
     BridgeFingerTrackerSource,
     BridgePoseSource,
     FingerTrackerSource,

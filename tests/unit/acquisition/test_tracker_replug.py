@@ -16,7 +16,11 @@ from services.acquisition.drivers.sdk_link import BridgeDriver
 from services.acquisition.mocks.faults import DeviceFaults
 from services.acquisition.mocks.pattern import pattern_streams
 from services.acquisition.mocks.ports import HidPort
-from services.acquisition.mocks.trackers import BridgePort, BridgePoseSource, PoseTrackerSource
+from services.acquisition.mocks.trackers_and_cameras import (
+    BridgePort,
+    BridgePoseSource,
+    PoseTrackerSource,
+)
 from services.acquisition.supervisor import DeviceSupervisor
 from tests.unit.acquisition.usb_bus import UsbPort
 

@@ -262,7 +262,7 @@ class UsbPort(MockPort):
 def usb_trackers():
     """Mock trackers that are made meanwhile are on USB instead of HID."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("services.acquisition.mocks.trackers.HidPort", UsbPort)
+        patch.setattr("services.acquisition.mocks.trackers_and_cameras.HidPort", UsbPort)
         yield
 
 

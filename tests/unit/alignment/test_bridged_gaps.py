@@ -102,8 +102,9 @@ def test_windows_keep_clear_of_interpolated_steps(tmp_path):
     lost = [("wrist_left", 200 * k, 200 * k + 6) for k in range(1, 10)]
     _, grid = episode_of(tmp_path, lost)
     stored = StoredEpisode(
-        "", "e", "t", "s", len(grid), (), "", "", "robot", 15.0, interpolated=grid.interpolated
-    )
+        url="", episode_id="e", task="t", scene="s", num_steps=len(grid), action_kinds=(),
+        content_sha256="", print_sha256="", model_rate_hz=15.0, interpolated=grid.interpolated,
+    )  # fmt: skip
     starts = window_starts(stored, 17)
     assert len(starts) > 90
     for start in range(len(grid) - 16):

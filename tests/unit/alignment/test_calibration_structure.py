@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import f_oneway, kstest
 
-from services.alignment.calibration.places import structure
+from services.alignment.calibration.motion import structure
 
 
 def test_groups_are_told_apart_as_by_the_analysis_of_variance():

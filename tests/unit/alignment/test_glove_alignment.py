@@ -7,7 +7,7 @@ from dextouch.episodes import EpisodeStore
 from dextouch.errors import InvalidInputError
 from dextouch.schemas import RecordingAttributes, matrix_rows
 from dextouch.streams import ClockCapabilities, SampleBatch, StreamDescriptor
-from dextouch.tactile.layout import expand_taxels, raw_indices
+from dextouch.tactile.layout import DEXTOUCH_V1, expand_taxels
 from services.acquisition.devices.justfloat_glove import JustFloatGloveDecoder
 from services.acquisition.devices.wuji_glove import WujiGloveDecoder
 from services.acquisition.mocks.gloves import (
@@ -148,8 +148,8 @@ def test_another_makers_glove_becomes_kpa(tmp_path, family, within_kpa):
 def test_refused_taxels_are_zero_named_and_counted(tmp_path):
     stream, batch, calibration = own_glove()
     state = np.zeros(360)
-    state[raw_indices(side="left")[[4, 90, 300]]] = (1, 1, 6)
-    batch.values[:, raw_indices(side="left")[17]] = 4000
+    state[DEXTOUCH_V1.raw_indices(side="left")[[4, 90, 300]]] = (1, 1, 6)
+    batch.values[:, DEXTOUCH_V1.raw_indices(side="left")[17]] = 4000
     calibration["tactile_left_taxel_state"] = matrix_rows(state[None])
     report, episode = align(tmp_path, stream, batch, calibration)
     named = {"dead": (4, 90), "stuck": (17,), "imprecise": (300,)}
@@ -169,7 +169,7 @@ def test_refused_taxels_are_zero_named_and_counted(tmp_path):
 def test_the_line_of_an_alignment_names_refused_taxels(tmp_path, capsys):
     stream, batch, calibration = own_glove()
     state = np.zeros(360)
-    state[raw_indices(side="left")[:20]] = 4
+    state[DEXTOUCH_V1.raw_indices(side="left")[:20]] = 4
     calibration["tactile_left_taxel_state"] = matrix_rows(state[None])
     align(tmp_path, stream, batch, calibration)
     assert main(["run", "take", "--store", str(tmp_path)]) == 0

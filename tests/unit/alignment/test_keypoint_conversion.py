@@ -7,7 +7,7 @@ from dextouch.errors import InvalidInputError
 from dextouch.geometry.rotations import rotation_from_vector
 from dextouch.schemas import matrix_rows
 from services.alignment.jobs import align_recording
-from services.alignment.retargeting.wrist_frame import calibration_name
+from services.alignment.retargeting.wrist import calibration_name
 from services.alignment.settings import AlignmentOptions
 from tests.accuracy.test_alignment import EpisodeStore, truth_streams, write_recording
 

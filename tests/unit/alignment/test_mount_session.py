@@ -8,8 +8,8 @@ import pytest
 
 from dextouch.errors import InvalidInputError, NotFoundError
 from services.acquisition.mocks import pattern
-from services.alignment.station_calibration import mount_session
-from services.alignment.station_calibration.mount_session import (
+from services.alignment.station_calibration import mount
+from services.alignment.station_calibration.mount import (
     MountSession,
     Sighting,
     num_kept_places,
@@ -108,7 +108,7 @@ def test_a_place_is_taken_by_order_and_the_last_one_is_dropped(options, images):
 
 
 def test_no_more_places_are_taken_than_the_session_keeps(options, images, monkeypatch):
-    monkeypatch.setattr(mount_session, "MAX_PLACES", 1)
+    monkeypatch.setattr(mount, "MAX_PLACES", 1)
     session = MountSession(options)
     show(session, images[0], 0)
     session.take()

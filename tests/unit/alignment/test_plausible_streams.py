@@ -1,9 +1,11 @@
 """Implausible values of a recording are left out of its episode, or refuse it, by their cause."""
 
 from dataclasses import replace
+from typing import get_args
 
 import numpy as np
 import pytest
+from rich.console import Console
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
@@ -18,13 +20,15 @@ from services.alignment.calibration.tactile_tare import (
     REASONS,
     STUCK,
     TactileCalibration,
+    taxel_faults,
+    unusable_taxels,
 )
-from services.alignment.calibration.taxel_faults import taxel_faults, unusable_taxels
-from services.alignment.command_line import report_line
+from services.alignment.command_line import WHY, report_line, report_page
 from services.alignment.jobs import align_recording
 from services.alignment.settings import AlignmentOptions
-from services.alignment.synchronization.plausible_streams import check_bodies
+from services.alignment.synchronization.episode_builder import check_bodies
 from services.alignment.synchronization.recorded_streams import date_stream
+from services.alignment.synchronization.resampling import RefusedReason
 from services.alignment.synchronization.stream_clock import time_stream
 from tests.unit.alignment import recordings
 
@@ -487,3 +491,8 @@ def test_the_command_says_what_it_left_out(tmp_path):
     assert "head: 199 frozen samples" in line
     assert "wrist_left: 1 samples elsewhere" in line
     assert "2 of 46 steps interpolated across gaps" in line
+    console = Console(width=120)
+    with console.capture() as page:
+        console.print(report_page(report))
+    assert "head: frozen samples" in page.get()
+    assert set(WHY) == set(get_args(RefusedReason))

@@ -9,8 +9,7 @@ import pytest
 
 from dextouch.clients import Reply
 from dextouch.errors import ConflictError, InvalidInputError, NotFoundError, UnknownNameError
-from services.alignment.station_calibration.judgement import judge
-from services.alignment.station_calibration.record import write_entry
+from services.alignment.station_calibration.record import judge, write_entry
 from services.alignment.station_calibration.routes import overview
 from services.alignment.station_calibration.runs import CalibrationRuns, RunRequest, StationLocation
 

@@ -5,12 +5,13 @@ import pytest
 
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
 from dextouch.schemas import matrix_rows
-from dextouch.tactile.layout import expand_taxels, raw_indices
+from dextouch.tactile.layout import DEXTOUCH_V1, expand_taxels
 from services.alignment.calibration.tactile_tare import (
     REASONS,
     TactileCalibration,
+    taxel_faults,
+    unusable_taxels,
 )
-from services.alignment.calibration.taxel_faults import taxel_faults, unusable_taxels
 
 RNG = np.random.default_rng(0)
 TARE, GAIN = RNG.uniform(110, 130, 360), RNG.uniform(38, 42, 360)
@@ -39,7 +40,7 @@ def test_pressures_come_back(side):
 
 @pytest.mark.parametrize(("kept", "reason"), [(4000, "stuck"), (0, "dead")])
 def test_taxels_that_stand_still_off_their_tare_are_silenced(kept, reason):
-    cell = int(raw_indices(side="right")[7])
+    cell = int(DEXTOUCH_V1.raw_indices(side="right")[7])
     counts = np.rint(np.broadcast_to(TARE + 200, (40, 360))).astype(np.uint16)
     counts[20:] += 1
     counts[:, cell] = kept
@@ -55,7 +56,7 @@ def test_taxels_that_stand_still_off_their_tare_are_silenced(kept, reason):
 
 
 def test_what_the_calibration_refuses_is_zero_and_its_gain_does_not_matter():
-    cells = raw_indices(side="left")[[3, 200]]
+    cells = DEXTOUCH_V1.raw_indices(side="left")[[3, 200]]
     state, gain = np.zeros(360), GAIN.copy()
     state[cells], gain[cells] = (1, 6), 0.0
     counts = np.rint(np.broadcast_to(TARE + 800, (40, 360))).astype(np.uint16)

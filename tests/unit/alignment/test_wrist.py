@@ -8,7 +8,7 @@ from dextouch.geometry import transform
 from dextouch.geometry.rotations import rotation_from_vector
 from dextouch.schemas import matrix_rows
 from services.alignment.recording_error import pose_difference
-from services.alignment.retargeting.wrist_frame import calibrated_transform
+from services.alignment.retargeting.wrist import calibrated_transform
 
 
 def test_difference_of_poses_is_in_metres_and_radians():

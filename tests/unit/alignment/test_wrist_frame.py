@@ -9,7 +9,7 @@ from dextouch.errors import InvalidInputError, ShapeError
 from dextouch.geometry import apply, invert
 from dextouch.geometry.rotations import rotation_angle, rotation_from_vector
 from dextouch.hands import KNUCKLE_NODES, METACARPAL_NODES, NODE_INDEX, PALM_NODES, WRIST_NODE
-from services.alignment.retargeting.wrist_frame import calibrate_wrist, wrist_frame
+from services.alignment.retargeting.wrist import calibrate_wrist, wrist_frame
 from tests.unit.alignment.tracked_hands import (
     any_rotation,
     flat_hand,

@@ -10,7 +10,7 @@ from dextouch.hands import NODE_INDEX
 from dextouch.schemas import matrix_rows
 from services.acquisition.mocks.pattern import pattern_streams
 from services.alignment.retargeting import HandRetargeter
-from services.alignment.retargeting.wrist_frame import (
+from services.alignment.retargeting.wrist import (
     calibrate_wrist,
     calibration_record,
     hand_axes_check,

@@ -16,9 +16,8 @@ from dextouch.bridges import exporting as files
 from dextouch.bridges.lerobot import (
     ExportOptions,
     export_dataset,
-    export_lerobot,
     exporting,
-    import_lerobot,
+    import_dataset,
 )
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import ConflictError, CorruptDataError, InvalidInputError, StorageError
@@ -63,8 +62,8 @@ def rows(folder, place):
 
 def test_appended_episodes_give_the_dataset_of_one_export(store, folder, tmp_path):
     readers = [episode(store, seed) for seed in LENGTHS]
-    export_lerobot(readers, tmp_path / "whole", repo_id="lab/touch")
-    export_lerobot(readers[:1], folder, repo_id="lab/touch")
+    export_dataset(readers, tmp_path / "whole", repo_id="lab/touch")
+    export_dataset(readers[:1], folder, repo_id="lab/touch")
     before = hashes(folder)
     first = export_dataset(readers[:3], folder, repo_id="lab/touch", options=APPEND)
     assert (first.num_episodes, first.num_frames) == (2, LENGTHS[4] + LENGTHS[5])
@@ -76,7 +75,7 @@ def test_appended_episodes_give_the_dataset_of_one_export(store, folder, tmp_pat
     changed = {name for name in before if before[name] != kept[name]}
     assert changed == {INFO, STATS, "README.md", "meta/tasks.parquet"}
     assert rows(folder, "data") == rows(tmp_path / "whole", "data")
-    ids = import_lerobot(folder, EpisodeStore(tmp_path / "other"))
+    ids = import_dataset(folder, EpisodeStore(tmp_path / "other")).ids
     assert ids == [reader.attributes.episode_id for reader in readers]
     whole, grown = (
         {(n, k): np.array(v) for n, kinds in read(f / STATS).items() for k, v in kinds.items()}
@@ -88,7 +87,7 @@ def test_appended_episodes_give_the_dataset_of_one_export(store, folder, tmp_pat
 
 def test_appending_what_is_there_changes_nothing(store, folder):
     reader = episode(store, 3)
-    export_lerobot([reader], folder, repo_id="lab/touch")
+    export_dataset([reader], folder, repo_id="lab/touch")
     before = hashes(folder)
     done = export_dataset([reader], folder, repo_id="lab/touch", options=APPEND)
     assert (done.num_episodes, done.present) == (0, (reader.item_id,))
@@ -131,7 +130,7 @@ def _touch(folder, _):
     "change", [_other_rate, _fewer_cameras, _other_codec, _other_shape, _other_splits, _touch]
 )
 def test_what_does_not_fit_is_refused_and_the_dataset_stays(store, folder, change):
-    export_lerobot([episode(store, 3)], folder, repo_id="lab/touch")
+    export_dataset([episode(store, 3)], folder, repo_id="lab/touch")
     options, words = change(folder, store)
     before = hashes(folder)
     with pytest.raises(InvalidInputError, match=words):
@@ -141,7 +140,7 @@ def test_what_does_not_fit_is_refused_and_the_dataset_stays(store, folder, chang
 
 
 def test_statistics_and_links_of_others_are_refused(store, folder, tmp_path):
-    export_lerobot([episode(store, 3)], folder, repo_id="lab/touch")
+    export_dataset([episode(store, 3)], folder, repo_id="lab/touch")
     new = episode(store, 4)
     (folder / "link").symlink_to(tmp_path)
     with pytest.raises(CorruptDataError, match="is a link"):
@@ -153,7 +152,7 @@ def test_statistics_and_links_of_others_are_refused(store, folder, tmp_path):
 
 
 def test_a_change_meanwhile_is_noticed(store, folder):
-    export_lerobot([episode(store, 3)], folder, repo_id="lab/touch")
+    export_dataset([episode(store, 3)], folder, repo_id="lab/touch")
 
     def readers():
         yield episode(store, 4)
@@ -197,7 +196,7 @@ export_dataset(readers, root / "exports/dataset", repo_id="lab/touch", options=o
     ["exchange", *(pytest.param(w, marks=pytest.mark.long) for w in _OTHERS)],
 )
 def test_a_killed_process_leaves_a_whole_dataset(store, folder, tmp_path, where):
-    export_lerobot([episode(store, 3)], folder, repo_id="lab/touch")
+    export_dataset([episode(store, 3)], folder, repo_id="lab/touch")
     before = hashes(folder)
     episode(store, 4)
     command = [sys.executable, "-c", CRASH, str(tmp_path), where]
@@ -226,7 +225,7 @@ def test_two_folders_are_exchanged_in_one_step(tmp_path):
 
 
 def test_disks_that_cannot_exchange_or_link_do_as_well(store, folder, monkeypatch):
-    export_lerobot([episode(store, 3)], folder, repo_id="lab/touch")
+    export_dataset([episode(store, 3)], folder, repo_id="lab/touch")
     monkeypatch.setattr(files, "_exchange", lambda *_: False)
     monkeypatch.setattr(os, "link", lambda *_: (_ for _ in ()).throw(OSError("no links")))
     export_dataset([episode(store, 4)], folder, repo_id="lab/touch", options=APPEND)
@@ -238,7 +237,7 @@ def test_disks_that_cannot_exchange_or_link_do_as_well(store, folder, monkeypatc
 
 
 def test_a_replacement_that_fails_leaves_the_old_dataset(store, folder, monkeypatch):
-    export_lerobot([episode(store, 3)], folder, repo_id="lab/touch")
+    export_dataset([episode(store, 3)], folder, repo_id="lab/touch")
     before = hashes(folder)
 
     def full(*_):
@@ -342,7 +341,7 @@ def test_the_card_is_valid_front_matter_and_says_what_there_is(store, folder):
 
 
 def test_tables_of_episodes_with_other_columns_are_refused(store, folder, monkeypatch):
-    export_lerobot([episode(store, 3)], folder, repo_id="lab/touch")
+    export_dataset([episode(store, 3)], folder, repo_id="lab/touch")
     monkeypatch.delitem(exporting.layout.QUANTILES, "q10")
     with pytest.raises(InvalidInputError, match="q10"):
         export_dataset([episode(store, 4)], folder, repo_id="lab/touch", options=APPEND)

@@ -12,8 +12,8 @@ import pytest
 from dextouch.bridges.lerobot import (
     ExportOptions,
     ImportOptions,
-    export_lerobot,
-    import_lerobot,
+    export_dataset,
+    import_dataset,
     source,
     video,
 )
@@ -48,7 +48,7 @@ SIDECAR = "meta/dextouch/episode-000000.json"
 def sound(tmp_path_factory):
     root = tmp_path_factory.mktemp("sound")
     reader = make_episode(num_steps=9).write(EpisodeStore(root / "store"))
-    export_lerobot([reader], root / "dataset", repo_id="touch")
+    export_dataset([reader], root / "dataset", repo_id="touch")
     return root / "dataset"
 
 
@@ -232,7 +232,7 @@ DAMAGE = {
 
 
 def test_the_sound_dataset_comes_in(folder, store):
-    assert import_lerobot(folder, store) == ["stand-bottle-0003"]
+    assert import_dataset(folder, store).ids == ["stand-bottle-0003"]
 
 
 @pytest.mark.long
@@ -242,7 +242,7 @@ def test_damage_is_named_and_nothing_is_stored(folder, store, name, unit):
     damage, error, words = DAMAGE[name]
     damage(folder)
     with pytest.raises(DexTouchError) as caught:
-        import_lerobot(folder, store, options=ImportOptions(images=unit))
+        import_dataset(folder, store, options=ImportOptions(images=unit))
     assert type(caught.value) is error
     assert words in caught.value.message
     assert store.list() == []
@@ -250,11 +250,11 @@ def test_damage_is_named_and_nothing_is_stored(folder, store, name, unit):
 
 def test_a_video_with_fewer_images_is_refused(folder, store, tmp_path):
     short = make_episode(num_steps=5).write(EpisodeStore(tmp_path / "short"))
-    export_lerobot([short], tmp_path / "other", repo_id="touch")
+    export_dataset([short], tmp_path / "other", repo_id="touch")
     shutil.copy(tmp_path / "other" / VIDEO, folder / VIDEO)
     for unit in ("h264", "rgb8"):
         with pytest.raises(CorruptDataError, match="image 5 of 9"):
-            import_lerobot(folder, store, options=ImportOptions(images=unit))
+            import_dataset(folder, store, options=ImportOptions(images=unit))
     assert store.list() == []
 
 
@@ -271,7 +271,7 @@ def test_a_video_with_fewer_images_is_refused(folder, store, tmp_path):
 def test_sizes_are_bounded(folder, store, monkeypatch, module, limit, value, error):
     monkeypatch.setattr(module, limit, value)
     with pytest.raises(error):
-        import_lerobot(folder, store)
+        import_dataset(folder, store)
     assert store.list() == []
 
 
@@ -297,7 +297,7 @@ def test_a_feature_of_a_video_cannot_leave_by_its_name(folder, store):
 
     edit_json(folder, INFO, rename)
     with pytest.raises(DexTouchError):
-        import_lerobot(folder, store, options=ImportOptions(mapping={"camera_head": "../../x"}))
+        import_dataset(folder, store, options=ImportOptions(mapping={"camera_head": "../../x"}))
     assert store.list() == []
 
 
@@ -314,7 +314,7 @@ def test_any_flipped_byte_of_the_metadata_is_survived(folder, store):
             prefix = f"f{place}-{name.count('a')}-"
             options = ImportOptions(id_prefix=prefix, images="rgb8", K_head=((1.0, 0.0, 0.0),) * 3)
             with contextlib.suppress(DexTouchError):
-                import_lerobot(folder, store, options=options)
+                import_dataset(folder, store, options=options)
         (folder / name).write_bytes(whole)
 
 
@@ -346,7 +346,7 @@ def test_an_export_that_fails_late_leaves_nothing(tmp_path, store):
     shard.write_bytes(data)
     exports = tmp_path / "exports"
     with pytest.raises(CorruptDataError, match="camera_head"):
-        export_lerobot(readers, exports / "x", repo_id="t", options=ExportOptions())
+        export_dataset(readers, exports / "x", repo_id="t", options=ExportOptions())
     assert list(exports.iterdir()) == []
 
 

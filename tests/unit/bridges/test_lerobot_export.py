@@ -8,7 +8,7 @@ import pyarrow.parquet as pq
 import pytest
 from av.bitstream import BitStreamFilterContext
 
-from dextouch.bridges.lerobot import ExportOptions, export_lerobot, exporting, video
+from dextouch.bridges.lerobot import ExportOptions, export_dataset, exporting, video
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import ConflictError, InvalidInputError, NotFoundError, ShapeError
 from dextouch.hands.actions import action_names, pose_to_9d, poses_from_actions
@@ -60,11 +60,10 @@ def images_of(path):
 @pytest.mark.parametrize("fps", [None, 30, 20])
 @pytest.mark.parametrize("unit", ["rgb8", "jpeg", "h264"])
 def test_exports_hold_to_the_specification(store, folder, unit, fps):
-    count = export_lerobot(
-        two(store, unit=unit), folder, repo_id="lab/touch", options=ExportOptions(fps=fps)
-    )
+    options = ExportOptions(fps=fps)
+    made = export_dataset(two(store, unit=unit), folder, repo_id="lab/touch", options=options)
     assert problems(folder) == []
-    assert count == {None: 38, 30: 33 + 41, 20: 22 + 27}[fps]
+    assert made.num_frames == {None: 38, 30: 33 + 41, 20: 22 + 27}[fps]
     assert sidecar(folder)["grid"] == {None: "model", 30: "camera", 20: "uniform"}[fps]
 
 
@@ -72,7 +71,7 @@ def test_one_camera_no_camera_and_measured_actions_only(store, tmp_path):
     readers = two(store, commanded=False)
     for cameras in (("camera_wrist_left",), ()):
         folder = tmp_path / f"with-{len(cameras)}"
-        export_lerobot(readers, folder, repo_id="touch", options=ExportOptions(cameras=cameras))
+        export_dataset(readers, folder, repo_id="touch", options=ExportOptions(cameras=cameras))
         assert problems(folder) == []
     assert "dextouch.action_measured" not in frames(folder)
     np.testing.assert_array_equal(
@@ -82,7 +81,7 @@ def test_one_camera_no_camera_and_measured_actions_only(store, tmp_path):
 
 def test_values_are_those_of_the_windows(store, folder):
     readers = two(store)
-    export_lerobot(readers, folder, repo_id="touch")
+    export_dataset(readers, folder, repo_id="touch")
     got = frames(folder)
     window = readers[1].window(0, 21, cameras=CAMERAS)
     part = slice(17, 38)
@@ -103,7 +102,7 @@ def test_values_are_those_of_the_windows(store, folder):
 
 def test_state_is_absolute(store, folder):
     readers = two(store)
-    export_lerobot(readers, folder, repo_id="touch")
+    export_dataset(readers, folder, repo_id="touch")
     poses = poses_from_actions(
         readers[0].read("action").values, readers[0].attributes.anchor.to_poses()
     )
@@ -125,7 +124,7 @@ def test_every_number_of_an_action_has_its_name():
 
 def test_off_the_model_grid_poses_lie_between_the_steps(store, folder):
     reader = two(store)[0]
-    export_lerobot([reader], folder, repo_id="touch", options=ExportOptions(fps=30))
+    export_dataset([reader], folder, repo_id="touch", options=ExportOptions(fps=30))
     got, measured = frames(folder)["dextouch.action_measured"], reader.read("action").values
     np.testing.assert_allclose(got[::2], measured, atol=1e-6)
     np.testing.assert_allclose(
@@ -142,7 +141,7 @@ def test_the_cameras_own_stamps_are_the_frames(store, folder):
     jitter = np.random.default_rng(5).integers(-4_000_000, 4_000_000, 33)
     made.stamps_ns["camera_head"] = made.stamps_ns["camera_head"] + jitter
     made.stamps_ns["camera_head"][20:] += 33_000_000
-    export_lerobot([made.write(store)], folder, repo_id="touch", options=ExportOptions(fps=30))
+    export_dataset([made.write(store)], folder, repo_id="touch", options=ExportOptions(fps=30))
     assert problems(folder) == []
     stamps = made.stamps_ns["camera_head"]
     stamps = stamps[stamps <= 16 / 15 * 1e9 + 0.5e9 / 30]
@@ -154,7 +153,7 @@ def test_the_cameras_own_stamps_are_the_frames(store, folder):
 
 def test_h264_is_copied_where_every_image_is_taken(store, folder):
     readers = two(store, unit="h264")
-    export_lerobot(readers, folder, repo_id="touch", options=ExportOptions(fps=30))
+    export_dataset(readers, folder, repo_id="touch", options=ExportOptions(fps=30))
     stored = [r.encoded_images("camera_head", 0, r.num_samples("camera_head")) for r in readers]
     assert units_of(folder / HEAD_VIDEO) == stored[0] + stored[1]
     decoded = np.concatenate([reader.images("camera_head") for reader in readers])
@@ -164,7 +163,7 @@ def test_h264_is_copied_where_every_image_is_taken(store, folder):
 
 def test_h264_is_encoded_anew_where_images_are_left_out(store, folder):
     readers = two(store, unit="h264")
-    export_lerobot(readers, folder, repo_id="touch")
+    export_dataset(readers, folder, repo_id="touch")
     assert sidecar(folder)["cameras"] == dict.fromkeys(CAMERAS, "encoded")
     decoded = np.concatenate([reader.images("camera_head")[::2] for reader in readers])
     error = np.array(images_of(folder / HEAD_VIDEO)).astype(int) - decoded
@@ -175,7 +174,7 @@ def test_other_parameter_sets_start_another_file(store, folder):
     copied = make_episode(seed=3, unit="h264", camera_hz=15).write(store)
     encoded = make_episode(seed=4, unit="jpeg", camera_hz=15).write(store)
     again = make_episode(seed=5, unit="jpeg", camera_hz=15).write(store)
-    export_lerobot([copied, encoded, again], folder, repo_id="touch")
+    export_dataset([copied, encoded, again], folder, repo_id="touch")
     assert problems(folder) == []
     table = pq.read_table(folder / "meta/episodes/chunk-000/file-000.parquet")
     key = "videos/observation.images.camera_head/file_index"
@@ -186,7 +185,7 @@ def test_large_files_are_followed_by_others(store, folder, monkeypatch):
     monkeypatch.setattr(video, "VIDEO_FILE_MB", 0)
     monkeypatch.setattr(exporting.layout, "DATA_FILE_MB", 0)
     monkeypatch.setattr(exporting, "ROWS_AT_ONCE", 1)
-    export_lerobot(two(store), folder, repo_id="touch")
+    export_dataset(two(store), folder, repo_id="touch")
     assert problems(folder) == []
     assert sorted(p.name for p in folder.glob("data/*/*")) == [
         "file-000.parquet",
@@ -198,7 +197,7 @@ def test_large_files_are_followed_by_others(store, folder, monkeypatch):
 def test_equal_episodes_give_equal_bytes(store, tmp_path):
     readers = two(store)
     for name in ("first", "second"):
-        export_lerobot(readers, tmp_path / name, repo_id="touch")
+        export_dataset(readers, tmp_path / name, repo_id="touch")
     files = [path for path in (tmp_path / "first").rglob("*") if path.is_file()]
     assert len(files) == 10
     paths = [path.relative_to(tmp_path / "first") for path in files]
@@ -208,7 +207,7 @@ def test_equal_episodes_give_equal_bytes(store, tmp_path):
 
 def test_what_lerobot_cannot_hold_is_beside_it(store, folder):
     readers = two(store)
-    export_lerobot(readers, folder, repo_id="touch")
+    export_dataset(readers, folder, repo_id="touch")
     said = sidecar(folder, 1)
     assert said["content_sha256"] == readers[1].content_sha256
     assert said["attributes"] == readers[1].attributes.model_dump(mode="json")
@@ -267,21 +266,21 @@ def _mixed(store):
 )
 def test_a_refused_export_leaves_nothing(store, folder, make, options, error, words):
     with pytest.raises(error, match=words):
-        export_lerobot(make(store), folder, repo_id="touch", options=ExportOptions(**options))
+        export_dataset(make(store), folder, repo_id="touch", options=ExportOptions(**options))
     assert not folder.parent.exists() or list(folder.parent.iterdir()) == []
 
 
 def test_rates_that_are_no_whole_numbers_are_refused(store, folder):
     reader = make_episode().write(store, model_rate_hz=12.5)
     with pytest.raises(InvalidInputError, match="whole frames"):
-        export_lerobot([reader], folder, repo_id="touch")
+        export_dataset([reader], folder, repo_id="touch")
 
 
 def test_an_existing_folder_and_a_strange_name_are_refused(store, folder):
     readers = two(store)
     folder.mkdir(parents=True)
     with pytest.raises(ConflictError, match="exists"):
-        export_lerobot(readers, folder, repo_id="touch")
+        export_dataset(readers, folder, repo_id="touch")
     for name in ("", "a/b/c", "../x", "a b"):
         with pytest.raises(InvalidInputError, match="repo_id"):
-            export_lerobot(readers, folder.with_name("new"), repo_id=name)
+            export_dataset(readers, folder.with_name("new"), repo_id=name)

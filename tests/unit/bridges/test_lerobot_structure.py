@@ -6,7 +6,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from dextouch.bridges.lerobot import export_lerobot
+from dextouch.bridges.lerobot import export_dataset
 from dextouch.episodes import EpisodeStore
 from tests.unit.bridges.lerobot_edits import (
     DATA,
@@ -31,9 +31,9 @@ def sound(tmp_path_factory):
     root = tmp_path_factory.mktemp("sound")
     store = EpisodeStore(root / "store")
     readers = [make_episode(seed=s, num_steps=n).write(store) for s, n in ((3, 5), (4, 7))]
-    export_lerobot(readers, root / "dataset", repo_id="touch")
+    export_dataset(readers, root / "dataset", repo_id="touch")
     one = root / "one"
-    export_lerobot(readers[:1], one, repo_id="touch")
+    export_dataset(readers[:1], one, repo_id="touch")
     return root / "dataset"
 
 

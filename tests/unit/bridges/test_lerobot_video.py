@@ -6,7 +6,7 @@ import av
 import numpy as np
 import pytest
 
-from dextouch.bridges.lerobot import ExportOptions, ImportOptions, export_lerobot, import_lerobot
+from dextouch.bridges.lerobot import ExportOptions, ImportOptions, export_dataset, import_dataset
 from dextouch.bridges.lerobot.layout import frames_of
 from dextouch.bridges.lerobot.video import (
     CameraVideo,
@@ -131,11 +131,11 @@ def test_video_that_cannot_be_copied_is_decoded(tmp_path, codec, b_frames):
 
 def test_datasets_with_other_codecs_come_in(store, tmp_path):
     reader = make_episode(num_steps=9).write(store)
-    export_lerobot([reader], tmp_path / "dataset", repo_id="touch")
+    export_dataset([reader], tmp_path / "dataset", repo_id="touch")
     images = reader.window(0, 9).images["camera_head"]
     write_video(tmp_path / "dataset" / VIDEO, images, b_frames=2)
     other = EpisodeStore(tmp_path / "other")
-    import_lerobot(tmp_path / "dataset", other, options=ImportOptions(images="h264"))
+    import_dataset(tmp_path / "dataset", other, options=ImportOptions(images="h264"))
     back = other.open(reader.attributes.episode_id)
     assert np.abs(back.images("camera_head").astype(int) - images).mean() < 5
 
@@ -150,7 +150,7 @@ def test_images_before_the_first_step_stop_the_copying(store, tmp_path):
     assert (np.diff(indices) == 1).all()
     assert stored_units(reader, "camera_head", indices) is None
     assert len(stored_units(reader, "camera_head", indices[5:])) == len(indices) - 5
-    export_lerobot([reader], tmp_path / "x", repo_id="touch", options=ExportOptions(fps=30))
+    export_dataset([reader], tmp_path / "x", repo_id="touch", options=ExportOptions(fps=30))
     decoded = np.array(
         list(read_images(VideoSpan(tmp_path / "x" / VIDEO, 0.0, 30, 30, (48, 64, 3))))
     )

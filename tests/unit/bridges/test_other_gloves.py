@@ -7,7 +7,7 @@ import pytest
 
 pytest.importorskip("pyarrow", reason="pyarrow is not installed: pip install '.[export]'")
 
-from dextouch.bridges.lerobot import export_lerobot, import_lerobot
+from dextouch.bridges.lerobot import export_dataset, import_dataset
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import InvalidInputError
 from tests.unit.world_model.conftest import make_episode, write_episode
@@ -17,10 +17,10 @@ from tests.unit.world_model.test_other_gloves import LAYOUT, small_episode
 def test_a_data_set_keeps_the_layout(tmp_path):
     store, back = EpisodeStore(tmp_path / "store"), EpisodeStore(tmp_path / "back")
     write_episode(store, small_episode(0), success=True)
-    export_lerobot([store.open("toy-0")], tmp_path / "set", repo_id="a/b")
+    export_dataset([store.open("toy-0")], tmp_path / "set", repo_id="a/b")
     info = json.loads((tmp_path / "set/meta/info.json").read_text())
     assert info["features"]["observation.tactile"]["shape"] == [2, 138]
-    (name,) = import_lerobot(tmp_path / "set", back)
+    (name,) = import_dataset(tmp_path / "set", back).ids
     episode = back.open(name)
     assert episode.tactile_layout == LAYOUT
     np.testing.assert_allclose(
@@ -34,4 +34,4 @@ def test_a_data_set_of_two_gloves_is_refused(tmp_path):
     write_episode(store, make_episode(1), success=True)
     readers = [store.open("toy-0"), store.open("toy-1")]
     with pytest.raises(InvalidInputError, match=r"got tactile layouts 'small'.*'dextouch_v1'"):
-        export_lerobot(readers, tmp_path / "set", repo_id="a/b")
+        export_dataset(readers, tmp_path / "set", repo_id="a/b")

@@ -18,7 +18,7 @@ from dextouch.schemas import RecordingAttributes, matrix_rows
 from dextouch.streams import SampleBatch, StreamDescriptor, encoded_values
 from services.acquisition.devices import load_calibration
 from services.alignment.calibration.motion import DegenerateMotionError
-from services.alignment.station_calibration.judgement import load
+from services.alignment.station_calibration.record import load_matrices
 from services.cli import main as command_line
 from services.pipelines.calibrate import main
 from services.pipelines.calibrate.show import show
@@ -204,7 +204,7 @@ def test_streams_without_common_motion_are_refused(tmp_path):
 
 
 def load_or_none(folder):
-    return load(folder) if (folder / "calibration.json").exists() else None
+    return load_matrices(folder) if (folder / "calibration.json").exists() else None
 
 
 def test_times_of_all_that_was_shaken_together(tmp_path, capsys):

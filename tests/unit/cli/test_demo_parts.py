@@ -21,7 +21,7 @@ from services.pipelines.parsers import FIRST_HELD_OUT_SEED, demo_plan
 from services.pipelines.servers import bind, served
 from services.pipelines.study import refuse_trained
 from services.twin.mistakes import DEVELOPMENT
-from services.twin.scripted_actions import mistake_of
+from services.twin.stage import mistake_of
 from services.world_model.checkpoints import write_state_checkpoint
 from tests.contracts.test_world import untrained_state_checkpoint
 from tests.unit.bridges.takes import write_episode, write_recording

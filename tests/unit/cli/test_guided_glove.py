@@ -21,7 +21,7 @@ from services.acquisition.recorder import Recorder
 from services.acquisition.station import LiveView
 from services.alignment.calibration.tactile_tare import TactileCalibration
 from services.alignment.station_calibration import glove
-from services.alignment.station_calibration.takes import TakeRecorder
+from services.alignment.station_calibration.record import TakeRecorder
 from services.pipelines.calibrate import main
 
 TRUTH = GloveCalibration.seeded("left", 4)

@@ -248,7 +248,7 @@ def test_requests_of_several_rollouts_go_together_where_the_server_says_so():
         requests = request.get("batch", [request])
         sizes.append(len(requests))
         # The first one waits for all others.
-        time.sleep(0.3 if len(sizes) == 1 else 0.01)
+        time.sleep(1.0 if len(sizes) == 1 else 0.01)
         answers = [linear(one) for one in requests]
         return {"batch": answers} if "batch" in request else answers[0]
 

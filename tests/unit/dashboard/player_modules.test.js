@@ -4,21 +4,17 @@ import assert from "node:assert/strict";
 import { readdirSync, readFileSync } from "node:fs";
 import { test } from "node:test";
 
-import { exportCommand, itemsOfKind } from "./static/catalog/export_command.js";
-import { date } from "./static/dates.js";
-import { bytes } from "./static/format.js";
-import { Blocks, lastAtOrBefore } from "./static/player/blocks.js";
-import { binCentres, componentWords, isSignal, withGaps } from "./static/player/curves.js";
-import { relabelCommand, stepsOf, trimCommand } from "./static/player/edit_spans.js";
-import { FetchQueue } from "./static/player/fetch_queue.js";
-import { byStage, largestChange, worstOf } from "./static/player/figures.js";
+import { exportCommand, itemsOfKind } from "./static/catalog/export.js";
+import { bytes, date } from "./static/format.js";
+import { Blocks, FetchQueue, lastAtOrBefore } from "./static/player/tracks.js";
+import { binCentres, componentWords, isSignal, withGaps } from "./static/player/plots.js";
+import { relabelCommand, stepsOf, trimCommand } from "./static/player/editing.js";
+import { byStage, largestChange, worstOf } from "./static/player/facts.js";
 import { HandDriving, moveOf } from "./static/hand_driving.js";
 import { outcomeOf } from "./static/rollout_rows.js";
 import { unpack } from "./static/packed.js";
-import { apply, matrixOfPose } from "./static/projection.js";
-import { PlayClock } from "./static/player/play_clock.js";
-import { allAfter, clockText, parseSeconds, secondsText, stampOf, ticks, tickText } from "./static/player/times.js";
-import { formatState, parseState } from "./static/player/url_state.js";
+import { apply, matrixOfPose } from "./static/poses.js";
+import { allAfter, clockText, formatState, parseSeconds, parseState, PlayClock, secondsText, stampOf, ticks, tickText } from "./static/player/times.js";
 
 const near = (found, expected) => found.forEach((value, k) => assert.ok(Math.abs(value - expected[k]) < 1e-12, `${found} is not ${expected}`));
 

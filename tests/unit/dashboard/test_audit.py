@@ -316,7 +316,7 @@ def test_a_full_disk_loses_nothing_silently(folder, monkeypatch):
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr("services.dashboard.audit.os.write", full)
+        patch.setattr("services.dashboard.audit.os.writev", full)
         log.write(entry(2))
     log.write(entry(3))
     page = log.newest(10)

@@ -33,7 +33,7 @@ def documents(tmp_path):
 
 def test_links_lead_to_documents_and_nothing_runs(documents):
     found = documents.read("first")
-    assert dict(found.titles) == {"first": "First & last", "second": "Second"}
+    assert documents.titles == {"first": "First & last", "second": "Second"}
     for expected in (
         "<h1",
         '<h2 id="signing-in-out">Signing in, out</h2>',
@@ -44,9 +44,9 @@ def test_links_lead_to_documents_and_nothing_runs(documents):
         "a chart",
         "<td>&lt;script&gt;alert(1)&lt;/script&gt;</td>",
     ):
-        assert expected in found.html
-    assert "<img" not in found.html
-    assert '<a href="/help/first">first</a>' in documents.read("decisions/0001-x").html
+        assert expected in found
+    assert "<img" not in found
+    assert '<a href="/help/first">first</a>' in documents.read("decisions/0001-x")
 
 
 @pytest.mark.parametrize("name", ["third", "../secret", "", "first.md"])
@@ -57,7 +57,7 @@ def test_only_documents_of_the_folder_are_read(documents, tmp_path, name):
 
 
 def test_every_screen_has_a_section_in_the_document_of_the_dashboard():
-    html = Documents(find_documents()).read("dashboard").html
+    html = Documents(find_documents()).read("dashboard")
     for screen in SCREENS:
         assert not screen.help or f'id="{screen.help}"' in html
     assert sum(bool(screen.help) for screen in SCREENS) == len(SCREENS) - 1

@@ -296,7 +296,7 @@ async def test_pose_messages_say_the_age_of_every_tracker(feeds):
 
 
 def test_the_page_draws_every_topic(feeds):
-    page = Path(app.STATIC / "main.js").read_text(encoding="utf-8")
+    page = Path(app.STATIC / "station.js").read_text(encoding="utf-8")
     handlers = page.split("const topics = {")[1].split("\n};")[0]
     # Taxels and poses are bytes, with handlers of their own; studies are on other pages.
     assert set(feeds.topics) - {"taxels", "poses", "studies"} <= set(

@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 
 from dextouch.hands import mean_hand_m
-from dextouch.tactile import DEXTOUCH_V1, PADS, hand_canvas, pad_forces_n
+from dextouch.tactile import DEXTOUCH_V1, PADS
 from dextouch.tactile.layout import split_pads
 from services.dashboard.app import STATIC
 from services.dashboard.feeds import heatmap_layout, pose_message, skeleton_bones
 from tests.unit.other_gloves import small_layout
 
-# Vertical field of view of static/projection.js.
+# Vertical field of view of static/poses.js.
 FOVY_RAD = 0.7
 NODE = shutil.which("node")
 
@@ -93,11 +93,13 @@ def test_projection_in_node(tmp_path):
         for side in ("left", "right")
     }
     cases["own_canvases"] = {
-        side: np.nan_to_num(hand_canvas(np.arange(320.0), side=side), nan=-1).ravel().tolist()
+        side: np.nan_to_num(DEXTOUCH_V1.hand_canvas(np.arange(320.0), side=side), nan=-1)
+        .ravel()
+        .tolist()
         for side in ("left", "right")
     }
     cases["own_layout"] = DEXTOUCH_V1.model_dump(mode="json")
-    cases["forces"] = pad_forces_n(pressures[None])[0].tolist()
+    cases["forces"] = DEXTOUCH_V1.pad_forces_n(pressures[None])[0].tolist()
     path = tmp_path / "cases.json"
     path.write_text(json.dumps(cases))
     script = Path(__file__).parent / "js" / "projection.test.mjs"

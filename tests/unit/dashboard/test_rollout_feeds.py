@@ -116,8 +116,8 @@ async def test_worlds_say_the_layout_of_their_gloves():
     async with app.router.lifespan_context(app):
         feeds = Feeds({"twin": upstream_of("twin", app)}, SETTINGS)
         worlds = (await RolloutFeeds(feeds, SETTINGS).listed()).model_dump(mode="json")["worlds"]
-    told = {world["name"]: world.get("tactile_layout") for world in worlds}
-    assert told == {"a": json.loads(layout.model_dump_json()), "b": None}
+    layouts = {world["name"]: world.get("tactile_layout") for world in worlds}
+    assert layouts == {"a": json.loads(layout.model_dump_json()), "b": None}
 
 
 async def test_a_watched_rollout_is_fetched_again_only_after_it_changed(world):
@@ -127,21 +127,21 @@ async def test_a_watched_rollout_is_fetched_again_only_after_it_changed(world):
     topic = feeds.topic(f"rollout/twin/{one.watch_id}")
     assert topic is feeds.topic(f"rollout/twin/{one.watch_id}")
     statuses = []
-    sent = world._sent
+    send = world.send
 
-    async def noted(request, **given):
-        answer = await sent(request, **given)
+    async def noted(*given, **options):
+        answer = await send(*given, **options)
         statuses.append(answer.status_code)
         return answer
 
-    world._sent = noted
+    world.send = noted
     first = await topic.fetch()
     assert await topic.fetch() == first
     assert statuses == [200, 304]
     header, _, _ = parsed(first[0])
     assert "id" not in header["rollout"]
     rollout_id = decode_answer(begun.content, max_bytes=10**6).rollout.id
-    await world.send("DELETE", f"/v1/rollouts/{rollout_id}")
+    await send("DELETE", f"/v1/rollouts/{rollout_id}")
     (gone,) = await topic.fetch()
     assert json.loads(gone)["data"]["gone"]
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from dextouch.tactile import hand_canvas
+from dextouch.tactile import DEXTOUCH_V1
 from services.dashboard.settings import DashboardSettings
 
 KEY = "a-key-of-some-length"
@@ -19,7 +19,7 @@ KEY = "a-key-of-some-length"
 @pytest.mark.parametrize(
     ("screen", "module"),
     [
-        ("/", "/static/main.js"),
+        ("/", "/static/station.js"),
         ("/episodes", "/static/catalog/episodes.js"),
         ("/objects", "/static/marking/objects.js"),
         ("/review", "/static/catalog/review.js"),
@@ -67,7 +67,7 @@ async def test_heatmap_is_that_of_the_report(client, side):
     taxels = np.arange(320, dtype=np.float32)
     drawn = np.full(layout["rows"] * layout["columns"], np.nan, dtype=np.float32)
     drawn[layout["cells"][side]] = taxels
-    np.testing.assert_array_equal(drawn.reshape(28, 26), hand_canvas(taxels, side=side))
+    np.testing.assert_array_equal(drawn.reshape(28, 26), DEXTOUCH_V1.hand_canvas(taxels, side=side))
 
 
 async def test_overview(client):

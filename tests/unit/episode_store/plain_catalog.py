@@ -49,7 +49,7 @@ def _entry(store, kind, name):
     about = reader.attributes
     parts = name, about.task, about.instruction, about.operator, about.station, about.trace_id
     return Entry(
-        item=item_of(reader, summary, store.review(name, kind=kind)),
+        item=item_of(reader, summary).model_copy(update={"review": store.review(name, kind=kind)}),
         summary=summary,
         quality=dict(about.quality),
         lineage=about.lineage,

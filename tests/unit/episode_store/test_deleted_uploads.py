@@ -8,8 +8,7 @@ from dextouch.episodes.care import DeletionRecords, DeletionRequest, delete_for_
 from dextouch.errors import ConflictError, StorageError
 from dextouch.schemas import FinishRecording
 from dextouch.streams import encode_batch
-from services.episode_store import app
-from services.episode_store.app import DeletionWatch
+from services.episode_store.app import PeriodicThread, deletion_watch
 from services.episode_store.committing import commit_spool
 from services.episode_store.ingest import Ingest
 from tests.unit.episode_store.conftest import GLOVE, glove_batch
@@ -63,7 +62,7 @@ def test_every_step_of_an_upload_is_refused_after_the_deletion(store, settings, 
         steps[step]()
     assert refused.value.details["reason"] == "take_deleted"
     ended = []
-    DeletionWatch(DeletionRecords(store.root), ingest.drop_deleted, ended.append).work()
+    deletion_watch(DeletionRecords(store.root), ingest.drop_deleted, ended.append)()
     assert ended == ["take-1"]
     assert is_gone(store)
     assert delete().complete
@@ -96,11 +95,8 @@ def test_other_uploads_go_on(store, settings, attributes, delete):
     assert store.list(kind="recording") == ["take-1"]
 
 
-def test_a_problem_that_comes_back_is_logged_again(store, monkeypatch):
+def test_a_problem_that_comes_back_is_logged_again():
     """The same failure twice in a row is one warning; after a look that succeeded it is another."""
-    monkeypatch.setattr(app, "WATCH_PERIOD_S", 0.0)
-    records = DeletionRecords(store.root)
-    watch = DeletionWatch(records, list, lambda _: None)
     looks = iter(["full", "full", None, "full"])
 
     def look():
@@ -110,7 +106,7 @@ def test_a_problem_that_comes_back_is_logged_again(store, monkeypatch):
         elif reason is not None:
             raise StorageError(reason)
 
-    monkeypatch.setattr(watch, "_work", look)
+    watch = PeriodicThread("fail_deletions", 0.0, look)
     with capture_logs() as logs:
         watch.start()
         watch._thread.join()

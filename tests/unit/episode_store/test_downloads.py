@@ -18,7 +18,7 @@ pytest.importorskip("mcap", reason="mcap is not installed: pip install '.[export
 
 from dextouch.bridges.mcap import import_mcap
 from dextouch.episodes import EpisodeStore
-from dextouch.episodes.care import DeletionRequest, delete_for_good, unfinished_folders
+from dextouch.episodes.care import DeletionRequest, delete_for_good, inspect_unfinished
 from dextouch.installation import install_command
 from dextouch.schemas import Review
 from services.episode_store import downloads
@@ -202,7 +202,6 @@ async def test_a_failure_on_the_way_cuts_the_connection(settings, store, capsys)
 KILLED = """
 import asyncio, os, sys
 from dextouch.episodes import EpisodeStore
-from dextouch.episodes.care import DeletionRequest, delete_for_good, unfinished_folders
 from services.episode_store.downloads import DownloadItems, Downloads
 from services.episode_store.settings import EpisodeStoreSettings
 store = EpisodeStore(sys.argv[1])
@@ -221,7 +220,7 @@ def test_a_killed_download_is_swept(store, scratch, tmp_path, how):
     subprocess.run([sys.executable, "-c", KILLED, str(store.root)], env=environment, check=False)
     (left,) = scratch.iterdir()
     assert {path.name for path in left.iterdir()} == {"item.mcap", "items.json"}
-    assert ("download", left) in unfinished_folders(store.root)
+    assert ("download", left.name) in [(r.kind, r.item_id) for r in inspect_unfinished(store.root)]
     if how == "start":
         assert store.sweep() == 1
     else:

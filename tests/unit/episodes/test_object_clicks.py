@@ -8,7 +8,7 @@ import pytest
 from dextouch.episodes import EpisodeStore, ObjectTrack, care, clicked_poses
 from dextouch.errors import InvalidInputError, NotFoundError, UnknownNameError
 from dextouch.geometry import transform_from_pose
-from dextouch.schemas import EpisodeClicks, ObjectClicks, load_object_clicks
+from dextouch.schemas import EpisodeClicks, ObjectClicks
 from services.cli.main import main
 from tests.unit.episode_store.episodes import IDENTITY_ROWS, POSES, write_episode
 from tests.unit.test_lens import looking_down, seen_by_opencv
@@ -224,7 +224,7 @@ def test_a_wrong_file_is_refused_with_the_place(tmp_path, content, says):
     path = tmp_path / "clicks.json"
     path.write_text(json.dumps(FILE | content))
     with pytest.raises(InvalidInputError, match=says):
-        load_object_clicks(path)
+        ObjectClicks.load(path)
 
 
 def test_what_clicks_need_does_not_change_what_alignment_makes():
@@ -252,7 +252,7 @@ def test_the_command_lists_places_and_collects_clicks(store, tmp_path, capsys):
     assert "40°" in printed
     assert "absent" in printed
     assert "nobody" not in printed
-    assert load_object_clicks(collected).episodes == {
+    assert ObjectClicks.load(collected).episodes == {
         "filed": clicks(), "kept": clicks(cup={"state": "absent"}),
     }  # fmt: skip
     path.write_text(json.dumps(FILE | {"episodes": {"gone": clicks().model_dump(mode="json")}}))

@@ -11,8 +11,7 @@ from dextouch.errors import ConflictError, InvalidInputError, ShapeError, Unknow
 from dextouch.schemas import Uncertainty
 from dextouch.worlds import WorldServiceSettings, create_world_app
 from dextouch.worlds.baseline import CopyFirstWorld
-from services.evaluation.closed_loop import EvaluationPlan, RolloutRunner, evaluate
-from services.evaluation.filmed_pairs import film
+from services.evaluation.closed_loop import EvaluationPlan, RolloutRunner, evaluate, film
 from services.evaluation.matched_starts import StudyWorlds, WorldAddress, matched_start
 from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
 from services.evaluation.policies.replay import HoldPolicy

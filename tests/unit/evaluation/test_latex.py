@@ -1,7 +1,8 @@
 """LaTeX tables, against a table written by hand."""
 
-from services.evaluation.reporting.sections import escape, latex_tables
+from services.evaluation.reporting.sections import latex_tables
 from services.evaluation.scores import ClosedLoopReport, RolloutScore
+from services.evaluation.templates import escape_latex
 
 # Three policies, four starts, two imagined worlds: rates 1, 0, .5 | .75, .25, .5 | .5, .5, .5.
 MARKS = {
@@ -63,6 +64,6 @@ def test_a_real_world_alone_has_one_table():
 
 
 def test_special_characters_are_escaped():
-    assert escape("50% of a_b & {c} #1 $x ~y^2 \\z") == (
+    assert escape_latex("50% of a_b & {c} #1 $x ~y^2 \\z") == (
         r"50\% of a\_b \& \{c\} \#1 \$x \textasciitilde{}y\textasciicircum{}2 \textbackslash{}z"
     )

@@ -12,16 +12,13 @@ import numpy as np
 import pytest
 
 from dextouch import __version__
-from services.evaluation.reporting import (
+from services.evaluation.reporting import pictures, write_report
+from services.evaluation.reporting.pictures import (
     ActionPicture,
     EpisodePicture,
+    Line,
     PredictionPicture,
     ReportPictures,
-    pictures,
-    write_report,
-)
-from services.evaluation.reporting.pictures import (
-    Line,
     data_address,
     hands_image,
     line_chart,
@@ -29,7 +26,8 @@ from services.evaluation.reporting.pictures import (
     scale_colours,
     ticks,
 )
-from services.evaluation.reporting.sections import clock_rows, error_rows, figure, tiles
+from services.evaluation.reporting.sections import clock_rows, error_rows, tiles
+from services.evaluation.templates import figure
 
 rng = np.random.default_rng(11)
 TIMES = np.linspace(0, 5, 4)

@@ -64,7 +64,7 @@ def test_a_report_is_written_before_anything_is_printed(
 ):
     save_checkpoint(tmp_path / "probe.safetensors", probe_checkpoint)
 
-    def gone(*_words):
+    def gone(*_words, **_how):
         raise BrokenPipeError
 
     monkeypatch.setattr("services.evaluation.command_line.print", gone, raising=False)

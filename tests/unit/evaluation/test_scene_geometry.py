@@ -7,7 +7,7 @@ from services.evaluation.prediction_scenes import (
     FAR_M,
     SceneGeometry,
     centroids,
-    geometry_error,
+    depth_errors,
     implied_depth,
     labelled,
     trajectory_accuracies,
@@ -72,7 +72,7 @@ def test_a_body_in_the_wrong_place_has_the_depth_error_of_both_places():
     depth_m = implied_depth(geometry, right)
     np.testing.assert_allclose(depth_m[geometry.labels == 2], 0.4)
     np.testing.assert_allclose(depth_m[geometry.labels == 0], FAR_M)
-    assert geometry_error([(geometry, right)]) == pytest.approx(0.0, abs=1e-12)
+    assert depth_errors(geometry, right) == pytest.approx([0.0], abs=1e-12)
     # 16 px say 0.5 of 0.4 m, 16 others 0.4 of 0.5 m, of the 340 px that show something.
     expected = (16 * 0.25 + 16 * 0.2) / (PX * (PX - 3))
-    assert geometry_error([(geometry, wrong)]) == pytest.approx(expected)
+    assert depth_errors(geometry, wrong) == pytest.approx([expected])

@@ -10,7 +10,8 @@ from scipy.stats import binomtest
 
 from dextouch.errors import InvalidInputError
 from services.evaluation.command_line import print_scores
-from services.evaluation.reporting import ReportPictures, write_report
+from services.evaluation.reporting import write_report
+from services.evaluation.reporting.pictures import ReportPictures
 from services.evaluation.reporting.sections import latex_tables, tiles
 from services.evaluation.scores import ClosedLoopReport, RolloutFailure, RolloutScore
 

@@ -12,7 +12,7 @@ from dextouch.errors import UnknownNameError
 from services.evaluation.reporting.policy_picture import COLOURS, policy_picture
 from services.evaluation.studies.app import StudyFolders
 from services.evaluation.studies.results import StudyResults
-from services.evaluation.studies.study_pictures import picture, write_pictures
+from services.evaluation.studies.study_figures import picture, write_pictures
 from tests.unit.evaluation.study_rows import ROWS, TASKS, counted, interval, write_study
 
 SVG = "{http://www.w3.org/2000/svg}"

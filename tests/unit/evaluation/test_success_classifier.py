@@ -47,7 +47,9 @@ def test_one_and_many_agree(probe_checkpoint):
     probe = SuccessClassifier(probe_checkpoint)
     endings = [final_ending(toy.demonstration("reach", s), 80) for s in range(4)]
     together = probe.probabilities(endings)
-    assert together == pytest.approx([probe.probability(e) for e in endings], abs=1e-6)
+    assert together == pytest.approx(
+        np.concatenate([probe.probabilities([e]) for e in endings]), abs=1e-6
+    )
 
 
 def test_both_outcomes_weigh_the_same(demonstrations):
@@ -72,12 +74,12 @@ def test_foreign_input_is_refused(probe_checkpoint):
     probe = SuccessClassifier(probe_checkpoint)
     ending = final_ending(toy.demonstration("reach", 0), 80)
     with pytest.raises(UnknownNameError, match="juggle"):
-        probe.probability(toy.replace(ending, task="juggle"))
+        probe.probabilities([toy.replace(ending, task="juggle")])
     with pytest.raises(InvalidInputError, match="no endings"):
         probe.probabilities([])
     large = np.zeros((3, 64, 64, 3), np.uint8)
     with pytest.raises(InvalidInputError, match="32, 32"):
-        probe.probability(toy.replace(ending, images=large))
+        probe.probabilities([toy.replace(ending, images=large)])
 
 
 def test_a_start_never_stands_on_both_sides(demonstrations):

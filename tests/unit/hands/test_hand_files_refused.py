@@ -137,7 +137,7 @@ def test_broken_mjcf_is_refused(old, new, message, tmp_path):
     [
         ('side = "right"', 'side = "r"', "unknown side 'r'; valid: left, right"),
         ('side = "right"', "", "mapping.toml side: got none, expected one"),
-        ('side = "right"', "side = 1", "mapping.toml side: got 1: Input should be a valid string"),
+        ('side = "right"', "side = 1", "mapping.toml side: got 1, expected: Input should be"),
         ('side = "right"', 'hand = "right"', "'hand'; valid: fingers, side"),
         ('side = "right"', 'side = "left"', "bend to the back of a left hand"),
         ('side = "right"', "side = ", "invalid TOML"),
@@ -157,7 +157,7 @@ def test_broken_mjcf_is_refused(old, new, message, tmp_path):
         ('chain = "index"', 'chain = "middle"', "chain 'middle' appears twice"),
         ('"joint_0", "joint_1"', '"joint_1", "joint_0"', "list exactly those"),
         ('"joint_0", ', "", "list exactly those, from the wrist outwards"),
-        ('"joint_0", ', "0, ", "fingers.0.joints.0: got 0: Input should be a valid string"),
+        ('"joint_0", ', "0, ", "fingers.0.joints.0: got 0, expected: Input should be"),
         ('knuckle = "joint_1"', 'knuckle = "joint_9"', "unknown knuckle of"),
         ('knuckle = "joint_1"', 'knuckle = "joint_3"', r"got hinges \(3, 2, 3\)"),
         ('tip = { link = "index_tip" }', 'tip = "index_tip"', "expected a table"),

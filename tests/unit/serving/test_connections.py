@@ -14,7 +14,14 @@ import uvicorn
 from fastapi import APIRouter, Request, Response, WebSocket, WebSocketDisconnect
 from structlog.testing import capture_logs
 
-from dextouch.serving import AS_SET, OCTETS, ServiceSettings, create_service_app, server_options
+from dextouch.serving import (
+    AS_SET,
+    OCTETS,
+    ServiceSettings,
+    connections,
+    create_service_app,
+    server_options,
+)
 from dextouch.serving.connections import MAX_REFUSED, accept_messages_of
 from dextouch.serving.guard import takes
 
@@ -353,6 +360,27 @@ def test_long_messages_in_many_frames_arrive_and_silence_between_them_is_no_mist
             opened.sendall(frame(LAST, b"a"))
             assert opened.recv(100)[2:] == b"40962"
             time.sleep(2 * TIMEOUT_S)
+
+
+def test_unfinished_messages_share_a_budget_and_the_first_begun_makes_room(monkeypatch):
+    monkeypatch.setattr(connections, "MAX_UNFINISHED_BYTES", 400 * 1024)
+    part = frame(BEGIN, bytes(60_000)) + 2 * frame(REST, bytes(60_000))
+    with Served(client_timeout_s=60).running() as served, ExitStack() as stack:
+        first, second, third = (stack.enter_context(inbox(served)) for _ in range(3))
+        for opened in (first, second, third):
+            opened.sendall(part)
+            opened.sendall(frame(PING, b"?"))
+            assert opened.recv(100)[-1:] == b"?"
+        # A close frame (RFC 6455, 5.5.1) with status 1013, and the end.
+        closed = first.makefile("rb").read()
+        assert (closed[0], closed[2:4]) == (0x88, (1013).to_bytes(2, "big"))
+        for opened in (second, third):
+            opened.sendall(frame(LAST, b"a"))
+            assert opened.recv(100)[2:] == b"180001"
+        # Their bytes are free again.
+        opened = stack.enter_context(inbox(served))
+        opened.sendall(part + frame(LAST, b"a"))
+        assert opened.recv(100)[2:] == b"180001"
 
 
 @pytest.mark.long

@@ -9,10 +9,9 @@ import pytest
 from dextouch.hands.actions import actions_from_poses
 from dextouch.schemas import RolloutStart
 from services.twin.demonstrators import NUM_GRID_STEPS
-from services.twin.scripted_actions import scripted_actions
 from services.twin.settings import TwinSettings
 from services.twin.simulation import MODEL_RATE_HZ
-from services.twin.stage import Stage, command_row
+from services.twin.stage import Stage, command_row, scripted_actions
 from services.twin.tasks import get_task
 from services.twin.tasks.cans import CAN_TASKS
 from services.twin.world import TwinWorld

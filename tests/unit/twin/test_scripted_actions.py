@@ -6,9 +6,8 @@ import pytest
 from dextouch.errors import InvalidInputError, UnknownNameError
 from dextouch.hands.actions import poses_from_actions
 from services.twin.mistakes import Mistake
-from services.twin.scripted_actions import mistake_name, mistake_of, script_name, scripted_actions
 from services.twin.settings import TwinSettings
-from services.twin.stage import Stage
+from services.twin.stage import Stage, mistake_name, mistake_of, script_name, scripted_actions
 
 SEED = 5
 

@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from dextouch.tactile.layout import taxel_areas_m2
+from dextouch.tactile.layout import DEXTOUCH_V1
 from services.twin.scene import compile_scene
 from services.twin.simulation import MAX_RELIEF_M, Command, Simulation, elastic_layer
 from services.twin.tasks.task import PALM_DOWN, flat, relaxed
@@ -40,7 +40,7 @@ def test_pressures_sum_to_the_contact_force():
         mujoco.mj_contactForce(simulation.scene.model, simulation.data, index, wrench)
         force_n += wrench[0]
     assert force_n > 1.0
-    felt_n = (simulation.tactile_kpa.astype(np.float64) * 1000.0 * taxel_areas_m2()).sum()
+    felt_n = (simulation.tactile_kpa.astype(np.float64) * 1000.0 * DEXTOUCH_V1.areas_m2).sum()
     assert felt_n == pytest.approx(force_n, rel=1e-6)
     assert simulation.pad_forces_n.sum() == pytest.approx(force_n, rel=1e-12)
     assert simulation.pad_forces_n[1, 5] == pytest.approx(force_n, rel=1e-12)

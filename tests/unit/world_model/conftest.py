@@ -25,6 +25,8 @@ from services.world_model.network.configuration import NetworkConfig
 from services.world_model.network.model import JointWorldModel
 from services.world_model.paper_settings import OptimizerSettings, TrainSettings, WindowSettings
 from services.world_model.training.dataset import EpisodeArrays, WindowSampler
+from services.world_model.training.distribution import ALONE
+from services.world_model.training.objective import LossOptions, errors, examples_of
 
 PX = 32
 K_HEAD = pinhole_matrix(width_px=PX, height_px=PX, fovy_rad=np.deg2rad(60))
@@ -59,6 +61,12 @@ def toy_episode():
 @pytest.fixture
 def toy_episodes():
     return [make_episode(seed) for seed in range(6)]
+
+
+def losses(model, batch, *, generator, options=LossOptions(), processes=ALONE):  # noqa: B008
+    """Errors of the prediction at random times."""
+    examples = examples_of(model, batch, generator=generator, options=options, processes=processes)
+    return errors(model, examples, options.precision)
 
 
 def make_episode(seed, num_steps=41):

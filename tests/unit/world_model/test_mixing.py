@@ -20,8 +20,7 @@ from services.world_model.paper_settings import (
     command_line,
 )
 from services.world_model.training.dataset import WindowSampler
-from services.world_model.training.episode_sets import check_tasks, subset_by_hash
-from services.world_model.training.episode_split import load_split
+from services.world_model.training.episode_sets import check_tasks, load_split, subset_by_hash
 from services.world_model.training.trainer import train
 from tests.unit.world_model.conftest import PX, human_episode, make_episode, write_episode
 

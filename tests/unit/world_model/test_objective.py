@@ -7,8 +7,9 @@ import torch
 from services.world_model.network.inputs import build_inputs
 from services.world_model.network.model import JointLatents
 from services.world_model.training.dataset import WindowSampler
-from services.world_model.training.objective import LossOptions, contact_or_changing, losses
+from services.world_model.training.objective import LossOptions, contact_or_changing
 from services.world_model.training.trainer import TrainingRun
+from tests.unit.world_model.conftest import losses
 
 
 @pytest.fixture

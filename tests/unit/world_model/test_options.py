@@ -17,8 +17,9 @@ from services.world_model.network.inputs import build_inputs
 from services.world_model.network.instruction import NO_WORD, instruction_ids
 from services.world_model.network.model import JointLatents, JointWorldModel, Sampling, stack_noise
 from services.world_model.training.dataset import WindowSampler
-from services.world_model.training.objective import LossOptions, contact_or_changing, losses
+from services.world_model.training.objective import LossOptions, contact_or_changing
 from services.world_model.world import open_world
+from tests.unit.world_model.conftest import losses
 
 CROSS = {"action_conditioning": "cross_attention", "add_condition_to_tokens": False}
 OPTIONS = [

@@ -13,9 +13,10 @@ from services.world_model.network.model import JointLatents
 from services.world_model.training import objective
 from services.world_model.training.dataset import WindowPosition, WindowSampler, stack_windows
 from services.world_model.training.distribution import Processes
-from services.world_model.training.objective import LossOptions, losses, own_context, own_noisy
+from services.world_model.training.objective import LossOptions, own_context, own_noisy
 from services.world_model.training.trainer import train, train_on
 from services.world_model.world import ModelWorld
+from tests.unit.world_model.conftest import losses
 from tests.unit.world_model.test_options import model_with
 from tests.unit.world_model.test_training_state import assert_same_run
 from tests.unit.world_model.test_world import make_start

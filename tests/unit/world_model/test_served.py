@@ -10,8 +10,7 @@ from httpx import ASGITransport, AsyncClient
 from dextouch.schemas import StartRequest, decode_answer, encode_start
 from dextouch.worlds import create_world_app
 from services.world_model.command_line import open_by_digest
-from services.world_model.settings import WorldModelSettings
-from services.world_model.shipped_checkpoints import PAPER_FORM, PRETRAINED, STATE_MODEL
+from services.world_model.settings import PAPER_FORM, PRETRAINED, STATE_MODEL, WorldModelSettings
 from services.world_model.world import ModelWorld
 from tests.unit.world_model.test_world import make_start
 

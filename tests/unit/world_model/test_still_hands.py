@@ -10,7 +10,7 @@ from dextouch.errors import EndedError
 from dextouch.hands.actions import CAMERA_HEAD
 from dextouch.schemas import ReturnSelector
 from dextouch.streams import HEAD_CAMERA
-from dextouch.worlds.warm_up import first_chunk_s
+from dextouch.worlds.world import first_chunk_s
 from tests.unit.world_model.test_world import make_start, world
 
 __all__ = ["world"]

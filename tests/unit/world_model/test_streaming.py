@@ -20,7 +20,7 @@ from services.world_model.training.dataset import (
     read_batches,
     read_episode,
 )
-from services.world_model.training.episode_split import load_split
+from services.world_model.training.episode_sets import load_split
 from services.world_model.training.trainer import TrainingRun, train
 from tests.unit.world_model.conftest import write_episode
 

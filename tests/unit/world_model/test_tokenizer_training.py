@@ -10,7 +10,7 @@ from services.world_model.checkpoints import read_checkpoint, read_tokenizer
 from services.world_model.network.configuration import NetworkConfig
 from services.world_model.network.tactile import build_tokenizer
 from services.world_model.paper_settings import TrainTokenizerSettings
-from services.world_model.training.episode_split import load_split
+from services.world_model.training.episode_sets import load_split
 from services.world_model.training.tokenizer_trainer import (
     TactileHands,
     load_hands,

@@ -11,8 +11,8 @@ from services.world_model.checkpoints import StateBounds
 from services.world_model.dynamics.features import DynamicsConfig
 from services.world_model.dynamics.model import DynamicsModel
 from services.world_model.state_world import StateWorld
+from services.world_model.training.evaluation import evaluate_dynamics
 from services.world_model.training.scene_table import scene_table
-from services.world_model.training.state_evaluation import evaluate_dynamics
 from tests.contracts.test_world import from_observation
 from tests.unit.world_model.test_rest import seeing_checkpoint
 from tests.unit.world_model.test_state_training import PX, episode

@@ -16,9 +16,8 @@ from dextouch.hands.actions import CAMERA_HEAD, reanchor
 from dextouch.schemas import ReturnSelector, StartRequest, decode_answer, encode_start
 from dextouch.worlds import create_world_app
 from services.world_model.checkpoints import read_checkpoint, write_checkpoint
-from services.world_model.network.inputs import build_inputs
+from services.world_model.network.inputs import MAX_KEPT, PastRule, build_inputs
 from services.world_model.network.model import JointWorldModel, Sampling
-from services.world_model.network.past import MAX_KEPT, PastRule
 from services.world_model.paper_settings import WindowSettings
 from services.world_model.plan import plan_of
 from services.world_model.pretrained_video import load_pretrained

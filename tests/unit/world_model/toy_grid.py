@@ -4,7 +4,7 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from dextouch.episodes import EpisodeGrid, ObjectTrack
+from dextouch.episodes import EpisodeGrid, ObjectTrack, measured_taxels
 from dextouch.hands.actions import AnchorPoses
 from dextouch.schemas import ActionKind, EpisodeAttributes
 from dextouch.tactile import DEXTOUCH_V1
@@ -35,6 +35,10 @@ class ToyGrid(EpisodeGrid):
     @property
     def content_sha256(self):
         return self.about.episode_id
+
+    @property
+    def measured_taxels(self):
+        return measured_taxels(self.about.calibration, self.tactile_layout.num_taxels)
 
     def touch(self):
         return self.tactile_kpa, np.ones(self.tactile_kpa.shape[:2], dtype=bool)

@@ -1,9 +1,6 @@
-"""Compiled retargeting solver, one small least-squares problem for each finger and sample.
+"""Compiled retargeting solver: its compilation by numba, and the folder that keeps compiled code.
 
-Here: its compilation by numba, and the folder that keeps compiled code between starts.
-
-numba notices changes of the file that holds a function, not of the files whose functions it calls.
-Compiled code is therefore kept in a folder that is named after the content of this whole package.
+The folder is named after the content of the package: numba would miss changes of called functions.
 """
 
 import hashlib
@@ -19,16 +16,7 @@ ROOT_UID = 0
 
 
 def folder_of_code(base: Path) -> Path | None:
-    """Folder for the compiled code of this version; no other user may enter or replace it.
-
-    Code in it is run without a question, so a folder that somebody else made is not used.
-
-    Args:
-        base: for the code of all versions; made if needed.
-
-    Returns:
-        None where there is no such folder that this user may write to.
-    """
+    """Folder below a base for this version's compiled code; None if others may write to it."""
     code = b"".join(path.read_bytes() for path in sorted(PACKAGE.glob("*.py")))
     try:
         # What a link leads to is checked and used, wherever the link leads later.

@@ -1,7 +1,4 @@
-"""What the compiled solver reads and writes: hand, person, options, results.
-
-Tables of fixed size are records: compiled functions hand on one pointer, and strides are constants.
-"""
+"""What the compiled solver reads and writes, as records: hand, person, options, results."""
 
 from dataclasses import astuple, dataclass, fields
 from enum import IntEnum
@@ -175,14 +172,12 @@ class RetargetOptions:
 
     Args:
         temporal_weight_m2: pull towards the sample before, m²/rad² at 60 Hz beside points of unit
-            weight (directions of people's bones count as points at 40 mm); at other rates in
-            proportion to the rate. 0 follows every sample exactly.
+            weight (directions of people's bones count as points at 40 mm), in proportion to the
+            rate. 0 follows every sample exactly.
         velocity_limit_rad_s: no joint turns faster from sample to sample.
-        max_step_rad: live (`HandRetargeter.step`), largest change of a joint between two outputs,
-            regardless of the elapsed time; the default is 9.6 rad/s at 30 Hz, the rate of the
-            slowest trackers.
-        pinch_far_m: from this distance of thumb and fingertip on the vector between them has no
-            weight, and they are solved apart.
+        max_step_rad: live, largest change of a joint between two outputs; the default is 9.6 rad/s
+            at 30 Hz, the rate of the slowest trackers.
+        pinch_far_m: from this distance of thumb and fingertip on they are solved apart.
         reacquire_after_s: a finger that was lost for so long is searched from several starts.
         num_starts: of such a search, 1 … 8.
     """
@@ -212,11 +207,7 @@ class RetargetOptions:
             raise InvalidInputError(f"retargeting options: got {', '.join(wrong)}")
 
     def tuning(self, *, is_live: bool = False) -> np.ndarray:
-        """The options as the record, shape [1], that the compiled solver reads.
-
-        Args:
-            is_live: every output is sent to motors, so no joint goes further than `max_step_rad`.
-        """
+        """The options as the record [1] that the solver reads; `is_live`, steps are limited."""
         types = [(field.name, field.type) for field in fields(self)]
         return np.array([(*astuple(self), is_live)], dtype=[*types, ("is_live", bool)])
 
@@ -224,14 +215,10 @@ class RetargetOptions:
 class Memory(NamedTuple):
     """State that one sample leaves for the next, changed in place.
 
-    Attributes:
-        joints_rad: [F, 6], previous result.
-        alone_rad: [F, 6], what fingers would do if there were no pinch.
-        unsolved_s: [F] since a finger was solved; infinite if it never was.
-        is_behind: [F] whether a finger that was lost is still on its way to where it is tracked.
-        points_m: [F, 4, 3], smoothed; NaN if never seen.
-        bones_m: [F, 3, 3], of `noise_of_bones`.
-        ease: [F, 3], of `ease_bones`.
+    `joints_rad` [F, 6] are the previous result, `alone_rad` what it would be without pinches,
+    `unsolved_s` [F] infinite for fingers never solved, `is_behind` those on the way to where they
+    are tracked again, `points_m` [F, 4, 3] smoothed, NaN if never seen; others as in `solve`,
+    `minimize`.
     """
 
     joints_rad: np.ndarray

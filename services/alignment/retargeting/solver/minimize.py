@@ -1,10 +1,8 @@
 """The least-squares problem of one finger or a group of pinching fingers, and its minimizer.
 
-Points of the virtual finger and their Jacobian give the cost and its Gauss–Newton Hessian.
-Levenberg–Marquardt with an active set: a joint at a border whose gradient points outward is held
-there, a step is cut at the border, so that limits hold exactly. A group is one finger alone, or the
-thumb and the fingers near it: an arrow-shaped system that is reduced to the thumb's block (Schur
-complement).
+Levenberg–Marquardt with an active set: a joint at a border whose gradient points outward is held, a
+step is cut at the border. Pinching fingers are an arrow-shaped system that is reduced to the
+thumb's block (Schur complement).
 """
 
 from typing import no_type_check
@@ -141,10 +139,7 @@ def point_terms(work, finger, num_joints):
 @compiled
 @no_type_check
 def bone_terms(hand, work, finger):
-    """Squared differences of the bones' unit vectors, times `BONE_M`, for people.
-
-    Over a missing point, the chord between its neighbours is a bone.
-    """
+    """Squared differences of people's unit bones times `BONE_M`; chords over missing points."""
     measured, usable = work.measured[finger], work.usable[finger]
     hessian, gradient = work.hessian[finger], work.gradient[finger]
     point, slope = work.point[finger], work.slope[finger]
@@ -189,11 +184,7 @@ def weigh_bones(work, finger, ease):
 @compiled
 @no_type_check
 def ease_bones(work, finger, ease):
-    """Let bones that the robot cannot turn as the person's weigh less in the next sample.
-
-    So does a pseudo-Huber loss, minimized by reweighting (Holland and Welsch 1977), once a sample:
-    beyond `BONE_BEND_RAD`, what a bone is off counts in proportion, no longer squared.
-    """
+    """Give less weight to bones that the robot cannot turn so (pseudo-Huber, `BONE_BEND_RAD`)."""
     measured, usable, point = work.measured[finger], work.usable[finger], work.point[finger]
     base = -1
     for index in range(NUM_POINTS):

@@ -1,11 +1,8 @@
 """Entry point of the compiled solver: joint angles for every sample of a tracked hand.
 
-Samples are checked for plausibility first, finger by finger.
-
-Every finger is a small least-squares problem in a box: points of a *virtual hand* (the robot's
-axes, the person's bones) against measured points, plus a pull towards the sample before. Thumb and
-fingers that come near one another are solved together: vectors between the robot's own fingertips
-against the measured ones.
+Every finger is a least-squares problem in a box: points of a *virtual hand* (the robot's axes, the
+person's bones) against measured points, plus a pull towards the sample before. Thumb and fingers
+near one another are solved together, by vectors between the robot's own fingertips.
 """
 
 from typing import no_type_check
@@ -37,7 +34,6 @@ from services.alignment.retargeting.solver.minimize import (
     solve_cold,
     weigh_bones,
 )
-from services.alignment.retargeting.solver.smoothing import follow_point, noise_of_bones
 
 # Two bones bent by more than 140° are an error of the tracker: hands and robot stop at 120°.
 MAX_BEND_COSINE = -0.766
@@ -45,6 +41,16 @@ MAX_BEND_COSINE = -0.766
 # faults (tests/accuracy/test_retargeting_fuzz.py) tips are within 0.9 mm of where they would be in
 # five samples, and 2.1 with one.
 COLD_ROUNDS = 10
+# Bones whose length a live hand's noise is found from count so many samples back (see
+# NUM_SAMPLES of the profile).
+NUM_RECENT = 240
+# What one wrong point may add to that noise: bones that are further off are errors of the tracker.
+MAX_DEVIATION_M = 0.008
+# Other lengths are no finger's bones in metres (BONE_RANGE_M of the profile).
+MIN_LENGTH_M, MAX_LENGTH_M = 0.003, 0.150
+# Mean of |x| of a normal distribution is 0.798 sigma; a bone's length has the noise of two points,
+# and a point has it along three axes: v = 3 (mean / 0.798)² / 2.
+VARIANCE_OF_DEVIATION = 3.0 * (np.pi / 2.0) / 2.0
 
 
 @compiled
@@ -74,9 +80,7 @@ def read_sample(hand, person, work, keypoints, memory):
 def check_finger(hand, person, tuning, work, finger, memory):
     """Which points of a finger to use; SOLVED, PARTIAL, IMPLAUSIBLE or MISSING. Bones get a scale.
 
-    Bones of a length or a bend that no finger has, and knuckles far from where they belong, are
-    errors of the tracker; the whole finger is rejected, because the wrong point cannot be
-    identified.
+    Impossible bones or a knuckle far off reject the whole finger: which point is wrong is unknown.
     """
     measured, usable = work.measured[finger], work.usable[finger]
     count, expected = 0, 0
@@ -145,10 +149,7 @@ def knuckle_error_m(hand, person, tuning, work, finger, memory):
 @compiled
 @no_type_check
 def find_pinches(hand, tuning, work, status):
-    """The thumb and all fingers near it into `members` and `is_near`; vectors and weights.
-
-    The weight goes from that of near to that of far evenly in its logarithm.
-    """
+    """Thumb and fingers near it into `members` and `is_near`; vectors and log-even weights."""
     thumb, measured, usable = hand.thumb, work.measured, work.usable
     work.is_near[:] = 0
     if thumb < 0 or status[thumb] >= IMPLAUSIBLE or not usable[thumb, 3]:
@@ -188,10 +189,7 @@ def set_box(hand, work, finger, before_rad, reach):
 @compiled
 @no_type_check
 def tip_error(work, finger, num_joints):
-    """Distance of the virtual tip from the measured one, both seen from the knuckle if it was.
-
-    Points are those before the last step, which is small enough for their slopes.
-    """
+    """Distance of the virtual tip from the measured one, before the small last step."""
     if not work.usable[finger, 3]:
         return 0.0
     squared = 0.0
@@ -299,10 +297,7 @@ def solve_pinches(hand, person, tuning, work, memory, num_near, output):
 @compiled
 @no_type_check
 def mark_reacquired(hand, person, work, memory, output):
-    """Fingers that the box keeps from where they are tracked are REACQUIRED until they are there.
-
-    Their tip error is that of the angles that come out.
-    """
+    """Fingers kept by the box from where they are tracked are REACQUIRED, with their tip error."""
     status, errors_m = output
     for finger in range(hand.num_fingers):
         if status[finger] >= IMPLAUSIBLE or not memory.is_behind[finger]:
@@ -325,14 +320,10 @@ def mark_reacquired(hand, person, work, memory, output):
 @compiled_once
 @no_type_check
 def retarget_samples(tables, samples, memory, output):
-    """Follow a tracked hand through T samples.
+    """Follow a tracked hand through T samples, from the `memory` before to that of the last.
 
-    Args:
-        tables: (hand, person, tuning, scratch), records of one element each.
-        samples: (keypoints [T, K, 3] m in wrist axes, NaN or infinite where missing; elapsed_s
-            [T], since the sample before).
-        memory: `Memory`, of the sample before the first; afterwards of the last.
-        output: `Output`, filled.
+    `tables` are hand, person, tuning and scratch, records of one element each; `samples` keypoints
+    [T, K, 3] (m in wrist axes, not finite where missing) and elapsed_s [T].
     """
     keypoints, elapsed_s = samples
     hand, person, tuning, work = tables[0][0], tables[1][0], tables[2][0], tables[3][0]
@@ -356,3 +347,72 @@ def retarget_samples(tables, samples, memory, output):
                 memory.unsolved_s[finger] = 0.0
         output.joints_rad[t] = joints
         output.status[t] = worst_of(status)
+
+
+@compiled
+@no_type_check
+def follow_point(before, now, variance_m2):
+    """Move a smoothed point, in place, to a new sample of it; NaN is no sample before."""
+    squared = 0.0
+    for k in range(3):
+        squared += (now[k] - before[k]) ** 2
+    part = 1.0
+    if np.isfinite(squared) and squared > 0.0:
+        part = squared / (squared + variance_m2)
+        for k in range(3):
+            before[k] += part * (now[k] - before[k])
+    else:
+        before[:] = now
+
+
+@compiled
+@no_type_check
+def noise_of_bones(bones_m, keypoints, nodes):
+    """Mean square of the noise's length, by how the lengths of bones differ from their mean.
+
+    Bones [F, 3, 3] are changed: how often seen, mean length and mean deviation of each. Keypoints
+    are [K, 3] of one sample; nodes [F, 4] of knuckle, PIP, DIP and tip, or -1.
+    """
+    total, count = 0.0, 0
+    for finger in range(len(bones_m)):
+        for bone in range(3):
+            a, b = nodes[finger, bone], nodes[finger, bone + 1]
+            one = bones_m[finger, bone]
+            squared = np.nan
+            if a >= 0 and b >= 0:
+                squared = 0.0
+                for k in range(3):
+                    squared += (keypoints[a, k] - keypoints[b, k]) ** 2
+            length = np.sqrt(squared)
+            # False for NaN, too.
+            if MIN_LENGTH_M <= length <= MAX_LENGTH_M:
+                one[0] = min(one[0] + 1.0, NUM_RECENT)
+                if one[0] == 1.0:
+                    one[1] = length
+                off = min(max(length - one[1], -MAX_DEVIATION_M), MAX_DEVIATION_M)
+                one[1] += off / one[0]
+                one[2] += (abs(off) - one[2]) / one[0]
+            if one[0] > 0.0:
+                total += one[2]
+                count += 1
+    return VARIANCE_OF_DEVIATION * (total / max(count, 1)) ** 2
+
+
+@compiled_once
+@no_type_check
+def smooth_forward(keypoints, variance_m2):
+    """Smooth the nodes of keypoints [T, K, 3] in time, in place; NaN stays, and is passed over."""
+    for node in range(keypoints.shape[1]):
+        before = keypoints[0, node].copy()
+        for t in range(1, len(keypoints)):
+            if np.isfinite(keypoints[t, node]).all():
+                follow_point(before, keypoints[t, node], variance_m2)
+                keypoints[t, node] = before
+
+
+def smoothed(keypoints_m: np.ndarray, sigma_m: float) -> np.ndarray:
+    """Keypoints [T, K, 3] smoothed by the tracker's sigma both ways; the mean has no lag."""
+    passes = keypoints_m.copy(), keypoints_m[::-1].copy()
+    for one in passes:
+        smooth_forward(one, 3.0 * sigma_m**2)
+    return np.asarray((passes[0] + passes[1][::-1]) / 2)

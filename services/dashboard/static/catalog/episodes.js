@@ -1,16 +1,13 @@
 // The list of recordings and episodes: filters in the address, rows that move on, deletion in two steps.
 
-import { element, find, repeat, setText } from "../dom.js";
+import { attempt, cell, element, find, newestOnly, onSubmit, repeat, setText, why } from "../dom.js";
 import { bytes, plural } from "../format.js";
-import { pagePath } from "../session.js";
-import { get, getIfServed, listChoices, newestJobs, post } from "./api.js";
-import * as cells from "./cells.js";
+import { get, getIfServed, listChoices, newestJobs, pagePath, post } from "../requests.js";
 import { ExportDialog } from "./export.js";
-import { Grid } from "./grid.js";
-import { listen, say, showSelected } from "./grid_keys.js";
-import { showLineage } from "./lineage.js";
-import { FILTERS, PAGE_ROWS, isFiltered, pageWords, readQuery, storeQuery, writeQuery } from "./query.js";
-import { itemsOf, playerPath, rowsOf, stageOf, subjectOf } from "./stage.js";
+import { Grid, listen, say, showSelected } from "./grid.js";
+import { itemsOf, playerPath, rowsOf, showLineage, stageOf, subjectOf } from "./items.js";
+import * as cells from "./items.js";
+import { FILTERS, isFiltered, PAGE_ROWS, pageWords, readQuery, storeQuery, writeQuery } from "./query.js";
 
 const REFRESH_MS = 3000;
 const CONFIRM_MS = 5000;
@@ -20,33 +17,26 @@ const form = find("filters");
 let query = readQuery(location.search);
 let rows = new Map();
 let total = 0;
-let asked = 0;
 let deletion = null;
 let lastMoved = [];
 
 // Rows
 
-function checkbox(name) {
-  return element("td", { class: "pick" }, element("input", { type: "checkbox", tabindex: -1, "aria-label": `select ${name}` }));
-}
-
 function itemRow({ item, job }) {
-  return element("tr", {}, checkbox(item.id), cells.timeCell(item.at), cells.taskCell(item), cells.nameCell(item, pagePath(playerPath(item))),
+  return element("tr", {}, cells.pickCell(item.id), cells.timeCell(item.at), cells.taskCell(item), cells.nameCell(item, pagePath(playerPath(item))),
     cells.operatorCell(item), cells.stationCell(item), cells.outcomeCell(item), cells.lengthCell(item), cells.qualityCell(item),
     cells.stageCell(stageOf({ item, job })));
 }
 
 function uploadRow({ id, task, station, upload }) {
-  const cell = (...children) => element("td", {}, ...children);
-  return element("tr", {}, cell(), cell("just now"), cell(element("strong", {}, task ?? "–")),
-    element("td", { class: "item_name_cell" }, element("span", { class: "clipped item_name" }, id), cells.under("recording")),
-    cell("–"), cell(station ?? "–"), cell("–"), element("td", { class: "number" }, "–"), cell("–"), cells.stageCell(stageOf({ upload })));
+  return element("tr", {}, cell(""), cell("just now"), cell(element("strong", {}, task ?? "–")),
+    cell([element("span", { class: "clipped item_name" }, id), why("recording")], "item_name_cell"),
+    cell("–"), cell(station ?? "–"), cell("–"), cell("–", "number"), cell("–"), cells.stageCell(stageOf({ upload })));
 }
 
 function trashRow(item) {
-  return element("tr", {}, checkbox(item.id), cells.timeCell(item.deleted_at),
-    element("td", { class: "item_name_cell" }, element("span", { class: "item_name" }, item.id), cells.under(item.kind)),
-    element("td", { class: "number" }, bytes(item.num_bytes)));
+  return element("tr", {}, cells.pickCell(item.id), cells.timeCell(item.deleted_at),
+    cell([element("span", { class: "item_name" }, item.id), why(item.kind)], "item_name_cell"), cell(bytes(item.num_bytes), "number"));
 }
 
 // Requests
@@ -77,43 +67,29 @@ function nothing() {
     element("code", {}, "dextouch demo"), " with the same data folder: its episodes appear here."];
 }
 
-async function refresh() {
-  const number = ++asked;
-  try {
-    const { made, total: counted } = await listed();
-    if (number !== asked) return;
-    total = counted;
-    rows = new Map(made.map((row) => [row.key, row]));
-    grid.show(made.map(({ key, build, ...state }) => ({ key, build, state: JSON.stringify([query.view, state]) })));
-    find("empty").hidden = made.length > 0;
-    find("empty").replaceChildren(...nothing());
-    setText(find("list_error"), "");
-    showPager();
-  } catch (error) {
-    if (number !== asked) return;
-    setText(find("list_error"), `The list is not up to date: ${error.message}`);
-  }
-}
+const refresh = newestOnly(listed, ({ made, total: counted }) => {
+  total = counted;
+  rows = new Map(made.map((row) => [row.key, row]));
+  grid.show(made.map(({ key, build, ...state }) => ({ key, build, state: JSON.stringify([query.view, state]) })));
+  find("empty").hidden = made.length > 0;
+  find("empty").replaceChildren(...nothing());
+  setText(find("list_error"), "");
+  showPager();
+}, (error) => setText(find("list_error"), `The list is not up to date: ${error.message}`));
 
 // Address and filters
 
 function go(changes, { isTyping = false } = {}) {
   query = { ...query, page: 1, ...changes };
-  const address = pagePath(`${location.pathname}${writeQuery(query)}`);
-  if (isTyping) history.replaceState(null, "", address);
-  else history.pushState(null, "", address);
+  history[isTyping ? "replaceState" : "pushState"](null, "", pagePath(`${location.pathname}${writeQuery(query)}`));
   showQuery();
   refresh();
 }
 
 function showQuery() {
   document.body.dataset.view = query.view;
-  for (const tab of document.querySelectorAll("[data-view-tab]")) {
-    tab.setAttribute("aria-pressed", String(tab.dataset.viewTab === query.view));
-  }
-  for (const name of FILTERS) {
-    if (document.activeElement !== form.elements[name]) form.elements[name].value = query.filters[name];
-  }
+  for (const tab of document.querySelectorAll("[data-view-tab]")) tab.setAttribute("aria-pressed", String(tab.dataset.viewTab === query.view));
+  for (const name of FILTERS) if (document.activeElement !== form.elements[name]) form.elements[name].value = query.filters[name];
   for (const head of document.querySelectorAll("[data-sort]")) {
     const isSorted = query.view !== "trash" && head.dataset.sort === query.sort;
     head.parentElement.setAttribute("aria-sort", isSorted ? (query.descending ? "descending" : "ascending") : "none");
@@ -209,11 +185,7 @@ async function align() {
 }
 
 async function act(work) {
-  try {
-    await work();
-  } catch (error) {
-    say(error.message, "ERROR");
-  }
+  await attempt(find("message"), work);
   await refresh();
 }
 
@@ -253,7 +225,7 @@ form.addEventListener("input", (event) => {
     changed = {};
   }, isTyping ? TYPING_MS : 0);
 });
-form.addEventListener("submit", (event) => { event.preventDefault(); document.activeElement?.blur(); grid.focus(); });
+onSubmit(form, () => { document.activeElement?.blur(); grid.focus(); });
 find("clear").addEventListener("click", () => go({ filters: Object.fromEntries(FILTERS.map((name) => [name, ""])) }));
 for (const tab of document.querySelectorAll("[data-view-tab]")) tab.addEventListener("click", () => { endDeletion(); say(""); go({ view: tab.dataset.viewTab }); });
 for (const head of document.querySelectorAll("[data-sort]")) {

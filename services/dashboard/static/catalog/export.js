@@ -1,12 +1,102 @@
 // Dialog that exports what is selected or filtered: the command, and a download of MCAP files.
 
-import { commandLine } from "../command.js";
-import { element, setText } from "../dom.js";
-import { plural } from "../format.js";
-import { get } from "./api.js";
-import { downloadControl } from "./download.js";
-import { exportCommand, itemsOfKind, kindsOf } from "./export_command.js";
-import { PAGE_ROWS, storeQuery } from "./query.js";
+import { button, commandLine, element, newestOnly, onSubmit, quote, say, setText } from "../dom.js";
+import { bytes, plural } from "../format.js";
+import { get, send } from "../requests.js";
+import { subjectOf } from "./items.js";
+import { FILTERS, midnight, storeQuery } from "./query.js";
+
+const OF_EPISODES = ["lerobot", "umi"];
+
+function kindsOf(format) {
+  return OF_EPISODES.includes(format) ? ["episode"] : ["episode", "recording"];
+}
+
+// Items of a kind in these rows: of a take its recording, or the episode that it is played as.
+export function itemsOfKind(items, kind) {
+  const found = items.flatMap((item) => [{ kind: item.kind, id: item.id }, subjectOf(item)]).filter((one) => one.kind === kind);
+  return [...new Map(found.map((one) => [one.id, one])).values()];
+}
+
+function destination(format, ids) {
+  if (format === "lerobot") return "lerobot/";
+  if (format === "umi") return "umi.zarr.zip";
+  return ids?.length === 1 ? `${ids[0]}.${format}` : "exports/";
+}
+
+function filterWords(filters) {
+  const values = { ...filters, from: filters.from && midnight(filters.from), to: filters.to && midnight(filters.to, 1) };
+  const flags = { from: "after", to: "before" };
+  return FILTERS.filter((name) => values[name]).flatMap((name) => `--${flags[name] ?? name}=${values[name]}`);
+}
+
+// `ids` of the selection, null for all that match the filters. Empty for a selection without an item
+// of the kind: a command without ids would export the whole store.
+export function exportCommand({ format, kind, ids, filters }) {
+  if (ids?.length === 0) return "";
+  const words = ["dextouch", "export", "--format", format, ...(kind === "recording" ? ["--kind", kind] : [])];
+  words.push(...(ids ?? filterWords(filters)), "--to", destination(format, ids));
+  return words.map(quote).join(" ");
+}
+
+const BROKE_OFF = "The download broke off; the log of the store says why. Nothing was saved.";
+
+function save(parts, name) {
+  const url = URL.createObjectURL(new Blob(parts));
+  element("a", { href: url, download: name }).click();
+  // The browser reads it after the click.
+  setTimeout(() => URL.revokeObjectURL(url), 60_000);
+}
+
+async function fetchAll(body, signal, onProgress) {
+  const answer = await send("/v1/episode_store/downloads", body, { signal });
+  const expected = Number(answer.headers.get("x-dextouch-estimated-bytes")) || 1;
+  const [, name] = /filename="([^"]+)"/.exec(answer.headers.get("content-disposition") ?? "") ?? [null, "dextouch.mcap"];
+  const parts = [];
+  let received = 0;
+  for (const reader = answer.body.getReader(); ;) {
+    const { done, value } = await reader.read().catch((error) => {
+      throw signal.aborted ? error : new Error(BROKE_OFF);
+    });
+    if (done) break;
+    parts.push(value);
+    received += value.length;
+    onProgress(received, expected);
+  }
+  return { parts, name, received };
+}
+
+// A button, and what shows how far it is. `listed` gives the body of the request, when it is pressed.
+export function downloadControl(listed) {
+  let aborting = null;
+  const cancel = button("Cancel download", () => aborting?.abort(), { hidden: "" });
+  const bar = element("progress", { max: "1", hidden: "", "aria-label": "download" });
+  const note = element("span", { class: "note", role: "status" });
+  const showBusy = (busy) => {
+    start.disabled = busy;
+    cancel.hidden = bar.hidden = !busy;
+    bar.removeAttribute("value");
+  };
+  const start = button("Download MCAP", async () => {
+    aborting = new AbortController();
+    showBusy(true);
+    say(note, "The store makes the files.");
+    try {
+      const { parts, name, received } = await fetchAll(await listed(), aborting.signal, (some, expected) => {
+        // The estimate is of the stored bytes; the end is known only when it is there.
+        bar.value = Math.min(some / expected, 0.99);
+        say(note, `${bytes(some)} of about ${bytes(expected)}`);
+      });
+      save(parts, name);
+      say(note, `${name}, ${bytes(received)}`);
+    } catch (error) {
+      if (aborting.signal.aborted) say(note, "Cancelled; nothing was saved.", "WARN");
+      else say(note, error.message, "ERROR");
+    }
+    showBusy(false);
+  }, { class: "primary" });
+  return element("div", { class: "download" }, start, bar, cancel, note);
+}
 
 // More than a store lets be downloaded at once, unless its settings were changed.
 const MAX_LISTED = 1000;
@@ -33,7 +123,8 @@ export class ExportDialog {
   #command = commandLine();
   #query;
   #rows = [];
-  #asked = 0;
+  #showCount = newestOnly(async ({ items, kind }) => [items?.length ?? (await pageOf(this.#query, kind, 1)).num_matching, kind],
+    ([count, kind]) => setText(this.#dialog.querySelector("[data-count]"), count ? plural(count, kind) : `no ${kind}`), (error) => setText(this.#dialog.querySelector("[data-count]"), error.message));
 
   constructor(dialog) {
     this.#dialog = dialog;
@@ -43,7 +134,7 @@ export class ExportDialog {
       element("p", { class: "quiet" }, "The command runs on the computer of the store; with another data folder than its default, add --store. Items that were rejected in review are left out, unless they are selected or filtered."),
       download);
     this.#form.addEventListener("input", () => this.#show());
-    this.#form.addEventListener("submit", (event) => event.preventDefault());
+    onSubmit(this.#form);
   }
 
   // `rows` are the selected items, empty for none.
@@ -72,7 +163,7 @@ export class ExportDialog {
     return { items: found, with_rejected: items !== null || this.#query.filters.review !== "" };
   }
 
-  async #show() {
+  #show() {
     const { kind, format } = this.#form.elements;
     const kinds = kindsOf(format.value);
     for (const option of kind.options) option.disabled = !kinds.includes(option.value);
@@ -82,13 +173,6 @@ export class ExportDialog {
     this.#command.show(command);
     this.#command.node.hidden = !command;
     this.#dialog.querySelector(".download").hidden = chosen.format !== "mcap" || !command;
-    const number = ++this.#asked;
-    const note = this.#dialog.querySelector("[data-count]");
-    try {
-      const count = chosen.items?.length ?? (await pageOf({ ...this.#query, limit: PAGE_ROWS }, chosen.kind, 1)).num_matching;
-      if (number === this.#asked) setText(note, count ? plural(count, chosen.kind) : `no ${chosen.kind}`);
-    } catch (error) {
-      if (number === this.#asked) setText(note, error.message);
-    }
+    this.#showCount(chosen);
   }
 }

@@ -1,15 +1,11 @@
 // Rows of a table that are walked and selected by keys; rows keep their place while their content changes.
 
+import { find, placeChildren, say as note, setText } from "../dom.js";
+
 export class Grid {
   // `onChange` is called when the selection or the row in focus changes, `onOpen` with the key of a row.
   constructor(body, { onChange, onOpen }) {
-    this.body = body;
-    this.onChange = onChange;
-    this.onOpen = onOpen;
-    this.keys = [];
-    this.rows = new Map();
-    this.selected = new Set();
-    this.active = null;
+    Object.assign(this, { body, onChange, onOpen, keys: [], rows: new Map(), selected: new Set(), active: null });
     body.addEventListener("click", (event) => this.onClick(event));
     body.addEventListener("focusin", (event) => this.activate(event.target.closest("tr")?.dataset.key ?? null));
     body.addEventListener("dblclick", (event) => {
@@ -33,9 +29,7 @@ export class Grid {
       this.rows.set(key, { state, node });
       return node;
     });
-    if (nodes.length !== this.body.children.length || nodes.some((node, index) => node !== this.body.children[index])) {
-      this.body.replaceChildren(...nodes);
-    }
+    placeChildren(this.body, nodes);
     this.selected = new Set([...this.selected].filter((key) => this.rows.has(key)));
     // The row that went is followed by the one in its place.
     if (!this.rows.has(this.active)) this.active = this.keys[Math.min(Math.max(place, 0), this.keys.length - 1)] ?? null;
@@ -68,10 +62,7 @@ export class Grid {
   }
 
   select(keys, isSelected) {
-    for (const key of keys) {
-      if (isSelected) this.selected.add(key);
-      else this.selected.delete(key);
-    }
+    for (const key of keys) this.selected[isSelected ? "add" : "delete"](key);
     this.mark();
     this.onChange();
   }
@@ -120,10 +111,36 @@ export class Grid {
 }
 
 // Keys that a page may use: not while typing, and not those of a button or link in focus.
-export function isFree(event) {
+function isFree(event) {
   const target = event.target;
   if (event.altKey || target.closest?.("dialog")) return false;
   if (target instanceof HTMLInputElement) return target.type === "checkbox" && event.key !== " ";
   if (target.matches?.("select, textarea")) return false;
   return !(target.closest?.("a, button, summary") && ["Enter", " "].includes(event.key));
+}
+
+// `actions` by key, `buttons` as [id, key]; the keys of the grid come first, and Esc leaves a field of `form`.
+export function listen(grid, { form, actions, buttons }) {
+  document.addEventListener("keydown", (event) => {
+    if (event.key === "Escape" && form.contains(event.target)) {
+      event.target.blur();
+      grid.focus();
+    } else if (isFree(event) && !grid.onKey(event) && !event.ctrlKey && !event.metaKey && !event.repeat) {
+      const act = actions[event.key.toLowerCase()];
+      if (act) {
+        event.preventDefault();
+        act();
+      }
+    }
+  });
+  for (const [id, key] of buttons) find(id).addEventListener("click", () => actions[key]());
+  find("pick_all").addEventListener("change", (event) => grid.select(grid.keys, event.target.checked));
+}
+
+export function showSelected(grid) {
+  setText(find("selected"), grid.selected.size ? `${grid.selected.size} selected` : "none selected: keys act on the focused row");
+}
+
+export function say(text, level = "OK") {
+  note(find("message"), text, level);
 }

@@ -1,7 +1,7 @@
 // What the list shows ↔ the page's address, and the request to the store. No DOM here.
 
 export const PAGE_ROWS = 50;
-export const VIEWS = ["take", "recording", "episode", "trash"];
+const VIEWS = ["take", "recording", "episode", "trash"];
 export const FILTERS = ["text", "task", "operator", "station", "domain", "outcome", "origin", "review", "from", "to"];
 const SORTS = ["time", "task", "id", "operator", "station", "duration", "findings"];
 // `station` in an address is the page's own, also on this page.
@@ -47,13 +47,13 @@ export function midnight(day, daysLater = 0) {
 }
 
 export function storeQuery({ view, sort, descending, page, filters }) {
-  const asked = new URLSearchParams({
+  const query = new URLSearchParams({
     kind: view, sort, descending: String(descending), limit: String(PAGE_ROWS), offset: String((page - 1) * PAGE_ROWS),
   });
-  for (const name of FILTERS) if (filters[name] && !["from", "to"].includes(name)) asked.set(name, filters[name]);
-  if (filters.from) asked.set("created_after", midnight(filters.from));
-  if (filters.to) asked.set("created_before", midnight(filters.to, 1));
-  return asked.toString();
+  for (const name of FILTERS) if (filters[name] && !["from", "to"].includes(name)) query.set(name, filters[name]);
+  if (filters.from) query.set("created_after", midnight(filters.from));
+  if (filters.to) query.set("created_before", midnight(filters.to, 1));
+  return query.toString();
 }
 
 export function pageWords(page, num_matching) {

@@ -1,15 +1,40 @@
 // The review queue: what needs a look first, accepted or rejected by keys; the store remembers it.
 
-import { element, find, repeat, setText } from "../dom.js";
-import { keep, kept } from "../kept.js";
-import { pagePath } from "../session.js";
-import { get, getIfServed, listChoices, post } from "./api.js";
-import * as cells from "./cells.js";
-import { Grid } from "./grid.js";
-import { listen, say, showSelected } from "./grid_keys.js";
-import { showLineage } from "./lineage.js";
-import { failedRecordings, fewWords, queueOf, reviewedItems } from "./queue.js";
-import { playerPath, reasonOf, subjectOf } from "./stage.js";
+import { attempt, cell, element, find, keep, kept, newestOnly, onSubmit, repeat, setText } from "../dom.js";
+import { plural } from "../format.js";
+import { get, getIfServed, listChoices, pagePath, post } from "../requests.js";
+import { Grid, listen, say, showSelected } from "./grid.js";
+import { playerPath, reasonOf, showLineage, subjectOf } from "./items.js";
+import * as cells from "./items.js";
+
+const MAX_FAILED = 200;
+
+// The last job of each recording whose alignment failed, newest first.
+function failedRecordings(alignments) {
+  const newest = alignments.filter((job) => job.state === "failed").reverse().slice(0, MAX_FAILED);
+  return new Map(newest.map((job) => [job.recording_id, job]));
+}
+
+// Recordings that could not be aligned first, then what the store flagged, in its order.
+function queueOf(flagged, { jobs, items }) {
+  const key = (item) => `${item.kind}/${item.id}`;
+  const failed = items.filter((item) => !item.episodes.length).map((item) => ({ key: key(item), item, job: jobs.get(item.id) }));
+  const known = new Set(failed.map((one) => one.key));
+  return [...failed, ...flagged.map((item) => ({ key: key(item), item })).filter((one) => !known.has(one.key))];
+}
+
+// A verdict on a take is one on all its episodes, or on its recording while it has none.
+function reviewedItems({ kind, id, episodes }) {
+  return kind === "recording" && episodes.length ? episodes.map((one) => ({ kind: "episode", id: one })) : [{ kind, id }];
+}
+
+function fewWords(groups, { task, origin }) {
+  const few = groups.filter((one) => !one.is_compared && (!task || one.task === task) && (!origin || one.origin === origin));
+  if (!few.length) return "";
+  const names = few.slice(0, 8).map((one) => `${one.task} (${plural(one.num_items, `${one.domain} ${one.kind}`)})`);
+  const more = few.length > 8 ? `, and ${few.length - 8} more` : "";
+  return `Too few to be compared, at least ${few[0].min_items} are needed: ${names.join(", ")}${more}.`;
+}
 
 const REFRESH_MS = 5000;
 const MAX_ROWS = 100;
@@ -18,21 +43,19 @@ const form = find("filters");
 const dialog = find("reject_dialog");
 const reasons = dialog.querySelector("form").elements;
 let rows = new Map();
-let asked = 0;
 let last = [];
 let rejected = [];
 
 function row({ item, job }) {
   const findings = item.findings.map((finding) => element("li", { "data-code": finding.code }, finding.message));
   if (job) findings.unshift(element("li", { "data-code": "alignment_failed", title: job.problem?.detail }, `alignment failed: ${reasonOf(job)}`));
-  const pick = element("td", { class: "pick" }, element("input", { type: "checkbox", tabindex: -1, "aria-label": `select ${item.id}` }));
-  return element("tr", {}, pick, element("td", {}, element("ul", { class: "findings" }, ...findings)), cells.timeCell(item.at), cells.taskCell(item),
+  return element("tr", {}, cells.pickCell(item.id), cell(element("ul", { class: "findings" }, ...findings)), cells.timeCell(item.at), cells.taskCell(item),
     cells.nameCell(item, pagePath(playerPath(item))), cells.operatorCell(item), cells.outcomeCell(item), cells.lengthCell(item));
 }
 
 // Requests
 
-function wanted(more) {
+function requested(more) {
   const query = new URLSearchParams({ review: "not_reviewed", ...more });
   for (const name of ["task", "origin"]) if (form.elements[name].value) query.set(name, form.elements[name].value);
   return query;
@@ -42,37 +65,31 @@ async function failed() {
   const { alignments } = await getIfServed("/v1/alignment/alignments?state=failed&limit=1000", { alignments: [] });
   const jobs = failedRecordings(alignments);
   if (!jobs.size) return { jobs, items: [] };
-  const query = wanted({ kind: "recording", limit: String(MAX_ROWS) });
+  const query = requested({ kind: "recording", limit: String(MAX_ROWS) });
   for (const id of jobs.keys()) query.append("id", id);
   const { items } = await get(`/v1/episode_store/catalog/items?${query}`);
   return { jobs, items };
 }
 
-async function refresh() {
-  const number = ++asked;
-  try {
-    const query = wanted({ flagged: "true", sort: "findings", descending: "true", limit: String(MAX_ROWS) });
-    const [page, unaligned, { groups }] = await Promise.all([
-      get(`/v1/episode_store/catalog/items?${query}`), failed(), get("/v1/episode_store/catalog/groups"),
-    ]);
-    if (number !== asked) return;
-    const queue = queueOf(page.items, unaligned);
-    rows = new Map(queue.map((one) => [one.key, one]));
-    grid.show(queue.map((one) => ({ key: one.key, state: JSON.stringify(one), build: () => row(one) })));
-    const more = Math.max(page.num_matching - page.items.length, 0);
-    setText(find("left"), queue.length ? `${queue.length + more} to review${more ? `, the first ${queue.length} listed` : ""}` : "");
-    find("empty").hidden = queue.length > 0;
-    setText(find("few"), fewWords(groups, { task: form.elements.task.value, origin: form.elements.origin.value }));
-    setText(find("list_error"), "");
-  } catch (error) {
-    if (number !== asked) return;
-    setText(find("list_error"), `The queue is not up to date: ${error.message}`);
-  }
+function read() {
+  const query = requested({ flagged: "true", sort: "findings", descending: "true", limit: String(MAX_ROWS) });
+  return Promise.all([get(`/v1/episode_store/catalog/items?${query}`), failed(), get("/v1/episode_store/catalog/groups")]);
 }
+
+const refresh = newestOnly(read, ([page, unaligned, { groups }]) => {
+  const queue = queueOf(page.items, unaligned);
+  rows = new Map(queue.map((one) => [one.key, one]));
+  grid.show(queue.map((one) => ({ key: one.key, state: JSON.stringify(one), build: () => row(one) })));
+  const more = Math.max(page.num_matching - page.items.length, 0);
+  setText(find("left"), queue.length ? `${queue.length + more} to review${more ? `, the first ${queue.length} listed` : ""}` : "");
+  find("empty").hidden = queue.length > 0;
+  setText(find("few"), fewWords(groups, { task: form.elements.task.value, origin: form.elements.origin.value }));
+  setText(find("list_error"), "");
+}, (error) => setText(find("list_error"), `The queue is not up to date: ${error.message}`));
 
 async function review(items, verdict, reason = "") {
   const words = { accepted: "accepted", rejected: "rejected", null: "in the queue again" };
-  try {
+  await attempt(find("message"), async () => {
     const refused = [];
     const reviewer = form.elements.reviewer.value.trim() || null;
     for (let first = 0; first < items.length; first += MAX_ITEMS) {
@@ -83,9 +100,7 @@ async function review(items, verdict, reason = "") {
     grid.select([...grid.selected], false);
     const done = items.length - refused.length;
     say(`${done} ${words[verdict]}${reason ? `: ${reason}` : ""}.${refused.length ? ` Refused: ${refused[0].reason}` : ""}`, refused.length ? "ERROR" : "OK");
-  } catch (error) {
-    say(error.message, "ERROR");
-  }
+  });
   find("undo").disabled = !last.length;
   await refresh();
 }
@@ -150,16 +165,13 @@ dialog.addEventListener("close", () => {
 });
 listen(grid, { form, actions: KEYS, buttons: [["accept", "a"], ["reject", "r"], ["undo", "z"], ["lineage", "l"]] });
 
-form.addEventListener("submit", (event) => event.preventDefault());
+onSubmit(form);
 form.addEventListener("input", (event) => {
-  if (event.target.name === "reviewer") {
-    keep("reviewer", event.target.value);
-    return;
-  }
+  if (event.target.name === "reviewer") return keep("reviewer", event.target.value);
   const { task, origin } = form.elements;
   const query = new URLSearchParams({ ...(task.value && { task: task.value }), ...(origin.value !== "recorded" && { origin: origin.value || "any" }) });
   history.replaceState(null, "", pagePath(`${location.pathname}?${query}`));
-  refresh();
+  return refresh();
 });
 
 const given = new URLSearchParams(location.search);

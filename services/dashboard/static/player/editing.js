@@ -1,13 +1,36 @@
 // Edits in the player: a selection on the timeline, notes on it, "Trim to selection" and "Relabel".
 // Each edit is first shown as the store would do it, with the command that does the same.
 
-import { post } from "../catalog/api.js";
-import { element, find, setText } from "../dom.js";
-import { keep, kept } from "../kept.js";
-import { pagePath } from "../session.js";
-import { relabelCommand, spanText, stepsOf, trimCommand } from "./edit_spans.js";
+import { attempt, button, element, find, isModified, keep, kept, onClick, quote, setText } from "../dom.js";
+import { pagePath, post } from "../requests.js";
 import { fetchFacts } from "./item.js";
-import { after, stampOf } from "./times.js";
+import { after, secondsText, stampOf } from "./times.js";
+
+// Steps of an episode at or after the start of a span and before its end: [first, stop]. The last step
+// belongs to a span that ends on it, since nothing can be selected after it.
+export function stepsOf([from_ns, to_ns], { num_steps, model_rate_hz }) {
+  const step = (t_ns) => Math.min(Math.max(Math.ceil((t_ns * model_rate_hz) / 1e9 - 1e-4), 0), num_steps);
+  const isWhole = (to_ns * model_rate_hz) / 1e9 > num_steps - 1 - 1e-4;
+  return [step(from_ns), isWhole ? num_steps : step(to_ns)];
+}
+
+function command(name, kind, ids, options) {
+  const words = Object.entries(options).flatMap(([key, value]) => (value === undefined || value === null || value === false || value === "" ? [] : value === true ? [`--${key}`] : [`--${key}`, ...[value].flat().map((one) => quote(String(one)))]));
+  return ["dextouch store", name, ...ids, ...(kind === "recording" ? ["--kind recording"] : []), ...words].join(" ");
+}
+
+export function trimCommand(id, [first, stop], { outcome, keep }) {
+  return command("trim", "episode", [id], { steps: [first, stop], outcome, keep });
+}
+
+export function relabelCommand({ kind, id }, { task, instruction, operator, outcome, keep }) {
+  return command("relabel", kind, [id], { task, instruction, operator, outcome, keep });
+}
+
+function spanText([from_ns, to_ns]) {
+  const ms = (t_ns) => secondsText(Math.round(t_ns / 1e6) * 1e6);
+  return from_ns === to_ns ? `${ms(from_ns)} s` : `${ms(from_ns)} – ${ms(to_ns)} s`;
+}
 
 const STORE = "/v1/episode_store";
 const LABELS = ["task", "instruction", "operator"];
@@ -15,32 +38,24 @@ const NOTE_COLOURS = 4;
 
 export class Editing {
   constructor(player) {
-    this.player = player;
-    this.item = player.item;
-    this.selection = null;
-    this.notes = [];
-    this.asked = 0;
-    this.path = `${STORE}/notes/${this.item.path}`;
+    Object.assign(this, { player, item: player.item, selection: null, notes: [], numPreviews: 0, path: `${STORE}/notes/${player.item.path}` });
     const { kind, num_steps } = this.item.about;
     find("open_trim").hidden = kind !== "episode" || !num_steps;
-    const click = (id, act) => find(id).addEventListener("click", act);
-    click("select_start", () => this.mark(0));
-    click("select_stop", () => this.mark(1));
-    click("select_none", () => this.select(null));
-    click("open_note", () => this.openNote());
-    click("open_trim", () => this.openTrim());
-    click("open_relabel", () => this.openRelabel());
+    onClick({
+      select_start: () => this.mark(0), select_stop: () => this.mark(1), select_none: () => this.select(null),
+      open_note: () => this.openNote(), open_trim: () => this.openTrim(), open_relabel: () => this.openRelabel(),
+    });
     this.dialog = find("edit_dialog");
     this.form = find("edit_form");
     this.fields = this.form.elements;
-    for (const button of this.dialog.querySelectorAll("[data-close]")) button.addEventListener("click", () => this.dialog.close());
+    for (const one of this.dialog.querySelectorAll("[data-close]")) one.addEventListener("click", () => this.dialog.close());
     document.addEventListener("keydown", (event) => this.pressed(event));
     this.select(null);
     this.load();
   }
 
   pressed(event) {
-    if (event.ctrlKey || event.metaKey || event.altKey || this.dialog.open || event.target.closest("input, select, textarea")) return;
+    if (isModified(event) || this.dialog.open || event.target.closest("input, select, textarea")) return;
     const acts = { "[": () => this.mark(0), "]": () => this.mark(1), n: () => this.openNote(), Escape: () => this.select(null) };
     if (!Object.hasOwn(acts, event.key)) return;
     event.preventDefault();
@@ -75,12 +90,8 @@ export class Editing {
 
   // Notes
 
-  async load() {
-    try {
-      this.show(await fetchFacts(this.path.slice(STORE.length)));
-    } catch (error) {
-      setText(find("notes_failure"), `Notes: ${error.message}`);
-    }
+  load() {
+    return attempt(find("notes_failure"), async () => this.show(await fetchFacts(this.path.slice(STORE.length))), "Notes: ");
   }
 
   show({ notes }) {
@@ -88,20 +99,14 @@ export class Editing {
     find("notes").hidden = !notes.length;
     setText(find("notes_failure"), "");
     find("note_rows").replaceChildren(...this.notes.map(({ note, span }) => {
-      const jump = element("button", { type: "button", class: "plain", title: "Go there" }, spanText(span));
-      jump.addEventListener("click", () => {
+      const jump = button(spanText(span), () => {
         this.select(span[0] < span[1] ? span : null);
         this.player.seek(span[0]);
-      });
-      const remove = element("button", { type: "button", class: "plain", title: "Remove this note", "aria-label": `remove note ${note.number}` }, "×");
-      remove.addEventListener("click", async () => {
-        try {
-          await post(`${this.path}/remove`, { number: note.number });
-          await this.load();
-        } catch (error) {
-          setText(find("notes_failure"), error.message);
-        }
-      });
+      }, { class: "plain", title: "Go there" });
+      const remove = button("×", () => attempt(find("notes_failure"), async () => {
+        await post(`${this.path}/remove`, { number: note.number });
+        await this.load();
+      }), { class: "plain", title: "Remove this note", "aria-label": `remove note ${note.number}` });
       return element("li", {}, jump, element("span", { class: "note_text" }, note.text), element("span", { class: "quiet" }, note.author ?? ""), remove);
     }));
     this.draw();
@@ -156,12 +161,12 @@ export class Editing {
       return () => this.showResult(result);
     });
     this.form.onchange = async () => {
-      const number = (this.asked += 1);
+      const number = (this.numPreviews += 1);
       apply.disabled = true;
       setText(find("edit_command"), command({ outcome: outcome.value, keep: keep.checked }));
       const result = await send(how(true)).catch((error) => error);
       // Of another dialog, or of fields that changed since.
-      if (number !== this.asked) return;
+      if (number !== this.numPreviews) return;
       const isRefused = result instanceof Error;
       apply.disabled = isRefused;
       const lines = isRefused ? [result.message] : [`Becomes ${result.id}; the source is then ${result.source_is}.`, ...result.messages];
@@ -192,12 +197,12 @@ export class Editing {
     setText(apply, verb);
     apply.disabled = false;
     find("edit_preview").replaceChildren();
-    this.asked += 1;
+    this.numPreviews += 1;
     this.form.onchange = null;
     const submit = async (event) => {
       event.preventDefault();
       apply.disabled = true;
-      this.asked += 1;
+      this.numPreviews += 1;
       const fail = (error) => () => {
         find("edit_failure").hidden = false;
         setText(find("edit_failure"), error.message);

@@ -1,7 +1,7 @@
 // A recording or episode in the store: its facts and streams, and what is read of them.
 
-import { ask, checked } from "../session.js";
 import { unpack } from "../packed.js";
+import { ask, checked } from "../requests.js";
 import { after, allAfter, parseExact, stampOf } from "./times.js";
 
 const STORE = "/v1/episode_store";

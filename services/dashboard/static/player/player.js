@@ -1,21 +1,19 @@
-// Panes, timeline, plots and keys around one playhead.
+// The player of a recording or an episode: panes, timeline, plots and keys around one playhead.
 
-import { element, find, setText } from "../dom.js";
-import { withLayout } from "../layouts.js";
-import { pagePath } from "../session.js";
-import { ActionPane, ACTION_SIZE } from "./action_pane.js";
-import { CameraPane } from "./camera_pane.js";
-import { componentWords, isSignal, signalParts } from "./curves.js";
-import { FetchQueue } from "./fetch_queue.js";
+import { beforeNextFrame } from "../canvas.js";
+import { element, find, isModified, onClick, onSubmit, setText } from "../dom.js";
+import { drawScale } from "../hands.js";
+import { ask, pagePath } from "../requests.js";
+import { withLayout } from "../taxels.js";
+import { onTheme } from "../theme.js";
+import { Editing } from "./editing.js";
+import { outcomeBadge, showFacts } from "./facts.js";
 import { Item } from "./item.js";
-import { PlayClock, SPEEDS } from "./play_clock.js";
-import { Plots } from "./plots.js";
-import { SpacePane } from "./space_pane.js";
-import { clockText, secondsText } from "./times.js";
+import { ACTION_SIZE, ActionPane, CameraPane, SpacePane, TouchPane } from "./panes.js";
+import { componentWords, isSignal, Plots, signalParts } from "./plots.js";
 import { Timeline } from "./timeline.js";
-import { TouchPane } from "./touch_pane.js";
-import { ImageTrack, RobotTrack, SampleTrack } from "./tracks.js";
-import { formatState } from "./url_state.js";
+import { clockText, formatState, parseState, PlayClock, secondsText, SPEEDS } from "./times.js";
+import { FetchQueue, ImageTrack, RobotTrack, SampleTrack } from "./tracks.js";
 
 const BUDGET_BYTES = 96e6;
 // While paused, little is loaded ahead: the store is free for the next place on the timeline.
@@ -35,7 +33,7 @@ function bind(box, set, isIn, onChange) {
   });
 }
 
-export class Player {
+class Player {
   constructor(item, heatmap, state) {
     this.item = item;
     this.heatmap = heatmap;
@@ -43,8 +41,8 @@ export class Player {
     this.clock.speed = SPEEDS.includes(state.speed) ? state.speed : 1;
     this.clock.seek(state.at_ns ?? item.begin_ns);
     this.queue = new FetchQueue({ budget_bytes: BUDGET_BYTES, onLoaded: () => this.request() });
+    this.request = beforeNextFrame((now_ms) => this.frame(now_ms));
     this.hidden = new Set(state.hidden);
-    this.raw = null;
     this.makePanes(state);
     this.plots = new Plots(find("plots"), item, {
       onSeek: (t_ns) => this.seek(t_ns),
@@ -162,46 +160,33 @@ export class Player {
     box.checked = true;
     const { item, reason } = await Item.openSource(this.item);
     if (!box.checked) return;
-    setText(find("raw_note"), item ? `raw: ${item.about.id}, by its arrivals` : `no raw signals: ${reason}`);
-    this.raw = item;
+    this.showRaw(item, item ? `raw: ${item.about.id}, by its arrivals` : `no raw signals: ${reason}`);
+  }
+
+  showRaw(item, words) {
+    setText(find("raw_note"), words);
     this.plots.setRaw(item);
     this.noteUrl();
   }
 
   listen() {
-    const click = (id, act) => find(id).addEventListener("click", act);
-    click("play", () => this.toggle());
-    click("back", () => this.step(-1));
-    click("forward", () => this.step(1));
-    click("zoom_in", () => this.timeline.zoom(0.5, this.clock.t_ns));
-    click("zoom_out", () => this.timeline.zoom(2, this.clock.t_ns));
-    click("zoom_fit", () => this.timeline.fit());
-    click("copy_link", () => this.copyLink());
+    onClick({
+      play: () => this.toggle(), back: () => this.step(-1), forward: () => this.step(1), copy_link: () => this.copyLink(),
+      zoom_in: () => this.timeline.zoom(0.5, this.clock.t_ns), zoom_out: () => this.timeline.zoom(2, this.clock.t_ns), zoom_fit: () => this.timeline.fit(),
+    });
     const speed = find("speed");
     speed.append(...SPEEDS.map((one) => element("option", { value: one }, `${one}×`)));
     speed.value = String(this.clock.speed);
     speed.addEventListener("change", () => this.setSpeed(Number(speed.value)));
     const raw = find("raw");
     raw.closest("label").hidden = this.item.about.kind !== "episode";
-    raw.addEventListener("change", () => {
-      if (raw.checked) {
-        this.compareRaw();
-        return;
-      }
-      this.raw = null;
-      setText(find("raw_note"), "");
-      this.plots.setRaw(null);
-      this.noteUrl();
-    });
+    raw.addEventListener("change", () => (raw.checked ? this.compareRaw() : this.showRaw(null, "")));
     for (const box of find("layers").querySelectorAll("input")) bind(box, this.hidden, false, () => { this.noteUrl(); this.request(); });
     const stream = find("signal_stream");
     stream.append(...[...this.item.streams.keys()].map((name) => element("option", { value: name }, name)));
     stream.addEventListener("change", () => this.listValues(stream.value));
     this.listValues(stream.value);
-    find("signal_form").addEventListener("submit", (event) => {
-      event.preventDefault();
-      this.submitSignal(stream.value, find("signal_value").value.trim());
-    });
+    onSubmit(find("signal_form"), () => this.submitSignal(stream.value, find("signal_value").value.trim()));
     document.addEventListener("keydown", (event) => this.pressed(event));
     document.addEventListener("pointerup", (event) => event.target.closest?.("button")?.blur());
     setInterval(() => {
@@ -229,7 +214,7 @@ export class Player {
   }
 
   pressed(event) {
-    if (event.ctrlKey || event.metaKey || event.altKey || event.target.closest("input:not([type=checkbox]), select, textarea")) return;
+    if (isModified(event) || event.target.closest("input:not([type=checkbox]), select, textarea")) return;
     const jumps = { ArrowLeft: -1, ArrowRight: 1 };
     const acts = {
       " ": () => this.toggle(),
@@ -296,15 +281,6 @@ export class Player {
     this.timeline.draw();
     this.timeline.note(find("zoom_note"));
     this.request();
-  }
-
-  request() {
-    if (this.frame_asked) return;
-    this.frame_asked = true;
-    requestAnimationFrame((now_ms) => {
-      this.frame_asked = false;
-      this.frame(now_ms);
-    });
   }
 
   frame(now_ms) {
@@ -377,4 +353,38 @@ export class Player {
     this.action?.draw();
     for (const pane of this.touch) if (pane.shown_ns !== null) pane.drawHand();
   }
+}
+
+function showTitle({ about }) {
+  document.title = `${about.id} · ${document.title}`;
+  setText(find("item_id"), about.id);
+  setText(find("item_kind"), about.kind);
+  find("outcome").replaceChildren(outcomeBadge(about.success));
+  setText(find("instruction"), [about.task, about.instruction].filter((text) => text).join(" · "));
+}
+
+async function open() {
+  const [, , kind, id] = location.pathname.split("/").map(decodeURIComponent);
+  const [item, heatmap] = await Promise.all([Item.open(kind, id), ask("/v1/heatmap").then((answer) => answer.json())]);
+  showTitle(item);
+  drawScale(find("scale"), heatmap);
+  const isRaw = item.ofKind("tactile").some((stream) => stream.unit !== "kPa");
+  setText(find("scale_end"), isRaw ? "largest count" : `${heatmap.full_scale_kpa} kPa`);
+  const player = new Player(item, heatmap, parseState(location.search));
+  const editing = new Editing(player);
+  showFacts(find("facts"), item, (span) => {
+    editing.select(span);
+    player.seek(span[0]);
+  });
+  return player;
+}
+
+let player = null;
+onTheme(() => player?.recolour());
+try {
+  player = await open();
+  find("player").hidden = find("deck").hidden = false;
+  player.start();
+} catch (error) {
+  find("failure").replaceChildren(element("p", { class: "note", "data-level": "ERROR", role: "alert" }, `This item cannot be played: ${error.message}`));
 }

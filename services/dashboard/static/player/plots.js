@@ -2,9 +2,63 @@
 // aligned one. Values are the lowest and highest of each bin, so that no peak is lost.
 
 import { css } from "../canvas.js";
-import { element, setText } from "../dom.js";
+import { button, element, setText } from "../dom.js";
 import uPlot from "../vendor/uplot/uPlot.esm.js";
-import { binCentres, signalParts, signalWords, withGaps } from "./curves.js";
+
+const GAP_PERIODS = 1.5;
+
+// Centres of the bins, in seconds for the axis.
+export function binCentres(start_ns, stop_ns, points) {
+  const step_ns = (stop_ns - start_ns) / points;
+  return Array.from({ length: points }, (_, k) => (start_ns + (k + 0.5) * step_ns) / 1e9);
+}
+
+// Values of bins as uPlot wants them: null where a gap begins, which breaks the line; undefined in
+// bins that are merely shorter than the time between two samples, which the line crosses.
+export function withGaps(values, bin_ns, period_ns) {
+  const longest = Math.floor((GAP_PERIODS * period_ns) / bin_ns) + 1;
+  const found = Array.from(values, (value) => (Number.isNaN(value) ? undefined : value));
+  let last = -1;
+  for (let k = 0; k <= found.length; k += 1) {
+    if (k < found.length && found[k] === undefined) continue;
+    const isGap = last < 0 || k === found.length || k - last > longest;
+    if (isGap) for (let empty = last + 1; empty < k; empty += 1) found[empty] = null;
+    last = k;
+  }
+  return found;
+}
+
+// Parts of the name of a signal: "action.3" is value 3 of the stream "action".
+export function signalParts(name) {
+  const dot = name.indexOf(".");
+  return dot < 0 ? { stream: name, what: "" } : { stream: name.slice(0, dot), what: name.slice(dot + 1) };
+}
+
+// The name of a value with its unit: "l_thumb_mcp_rad" is "left thumb mcp" in rad.
+export function componentWords(name) {
+  const [, text, unit = ""] = /^(.*?)(?:_(m|rad))?$/.exec(name);
+  return { text: text.replace(/^([lr])_/, (_, side) => (side === "l" ? "left " : "right ")).replace(/[._]/g, " "), unit };
+}
+
+// Title and unit of a signal.
+function signalWords(name, streams) {
+  const { stream, what } = signalParts(name);
+  const { components, unit } = streams.get(stream);
+  if (what === "interval_ms") return { title: `${stream}, time between samples`, unit: "ms" };
+  if (!components[what]) return { title: name, unit };
+  const words = componentWords(components[what]);
+  return { title: `${stream}: ${words.text}`, unit: words.unit };
+}
+
+export function isSignal(name, streams) {
+  const { stream, what } = signalParts(name);
+  const found = streams.get(stream);
+  if (!found) return false;
+  if (what === "interval_ms") return true;
+  if (found.kind === "image") return false;
+  const size = found.shape.reduce((product, axis) => product * axis, 1);
+  return !what || what === "max" || (/^\d{1,6}$/.test(what) && Number(what) < size);
+}
 
 const HEIGHT_PX = 110;
 const MAX_POINTS = 2000;
@@ -19,16 +73,7 @@ function sizeOf(root, name) {
 export class Plots {
   // `raw` is the recording on the episode's time, or null.
   constructor(root, item, { onSeek, onRemove, rawName }) {
-    this.root = root;
-    this.item = item;
-    this.raw = null;
-    this.rawName = rawName;
-    this.onSeek = onSeek;
-    this.onRemove = onRemove;
-    this.plots = new Map();
-    this.range = [item.start_ns, item.stop_ns];
-    this.t_ns = item.start_ns;
-    this.abort = null;
+    Object.assign(this, { root, item, rawName, onSeek, onRemove, raw: null, plots: new Map(), abort: null, range: [item.start_ns, item.stop_ns], t_ns: item.start_ns });
     new ResizeObserver(() => this.resize()).observe(root);
   }
 
@@ -47,8 +92,7 @@ export class Plots {
   made(name) {
     const note = element("span", { class: "plot_note" });
     const { title } = signalWords(name, this.item.streams);
-    const remove = element("button", { type: "button", class: "plain", title: `Remove the plot of ${title}`, "aria-label": `Remove ${title}` }, "×");
-    remove.addEventListener("click", () => this.onRemove(name));
+    const remove = button("×", () => this.onRemove(name), { class: "plain", title: `Remove the plot of ${title}`, "aria-label": `Remove ${title}` });
     const head = element("div", { class: "playhead" });
     const body = element("div", { class: "plot_body" });
     const root = element("div", { class: "plot", "data-signal": name, "data-state": "loading" },

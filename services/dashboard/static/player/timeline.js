@@ -1,8 +1,7 @@
 // The timeline: a ruler, a lane for each stream with its gaps, and the playhead; scrubbed by mouse and
 // keys, zoomed by wheel and buttons. `range` is the visible part, in nanoseconds of the player.
 
-import { element, setText } from "../dom.js";
-import { keep, kept } from "../kept.js";
+import { button, element, keep, kept, setText } from "../dom.js";
 import { clockText, secondsText, ticks, tickText } from "./times.js";
 
 const SHORTEST_RANGE_NS = 1e7;
@@ -34,18 +33,19 @@ function together(streams) {
 
 export class Timeline {
   constructor(root, item, { range, onSeek, onRange }) {
-    this.root = root;
-    this.bounds = [item.start_ns, Math.max(item.stop_ns, item.start_ns + SHORTEST_RANGE_NS)];
-    this.range = this.bounds;
-    this.onSeek = onSeek;
-    this.onRange = onRange;
+    Object.assign(this, { root, onSeek, onRange, marks: [] });
+    this.range = this.bounds = [item.start_ns, Math.max(item.stop_ns, item.start_ns + SHORTEST_RANGE_NS)];
     this.ruler = element("div", { class: "ruler" });
     this.head = element("div", { class: "playhead" });
     this.over = element("div", { class: "over" }, this.head);
-    this.marks = [];
     const streams = [...item.streams.values()];
     this.lanes = [together(streams), ...streams].map((stream) => this.lane(stream));
-    this.fold = element("button", { type: "button", class: "plain lane_name", title: "One line for all streams, or one for each" });
+    const turn = () => {
+      const isFolded = !root.classList.contains("folded");
+      this.setFolded(isFolded);
+      keep("timeline", isFolded ? "folded" : "open");
+    };
+    this.fold = button([], turn, { class: "plain lane_name", title: "One line for all streams, or one for each" });
     // Beside the slider: a slider cannot have controls in it.
     root.before(this.fold);
     root.append(element("div", { class: "lane ruler_row" }, element("span"), this.ruler, element("span", { class: "lane_note" })),
@@ -75,11 +75,6 @@ export class Timeline {
   }
 
   listen() {
-    this.fold.addEventListener("click", () => {
-      const isFolded = !this.root.classList.contains("folded");
-      this.setFolded(isFolded);
-      keep("timeline", isFolded ? "folded" : "open");
-    });
     const at = (event) => {
       const box = this.over.getBoundingClientRect();
       return this.range[0] + ((event.clientX - box.left) / Math.max(box.width, 1)) * (this.range[1] - this.range[0]);

@@ -1,5 +1,5 @@
-// Times of the player: whole nanoseconds after the item's zero, exact as Numbers for 104 days. Stamps
-// of the store are int64 and may be larger than a Number holds, so they are subtracted as BigInt.
+// Times of the player: whole nanoseconds after the item's zero, exact as Numbers for 104 days, the playhead, and the address of a moment. Stamps of the
+// store are int64 and may be larger than a Number holds, so they are subtracted as BigInt.
 
 const NS_PER_S = 1_000_000_000n;
 
@@ -62,4 +62,87 @@ export function ticks(from_ns, to_ns, wanted) {
 export function tickText(t_ns, step_ns) {
   const digits = Math.min(9, Math.max(0, -Math.floor(Math.log10(step_ns / 1e9) + 1e-9)));
   return (t_ns / 1e9).toFixed(digits);
+}
+
+export const SPEEDS = [0.25, 0.5, 1, 1.5, 2, 4];
+
+const LONGEST_STEP_MS = 250;
+
+export class PlayClock {
+  constructor(start_ns, stop_ns) {
+    Object.assign(this, { start_ns, stop_ns, t_ns: start_ns, speed: 1, playing: false, last_ms: null });
+  }
+
+  seek(t_ns) {
+    this.t_ns = Math.round(Math.min(Math.max(t_ns, this.start_ns), this.stop_ns));
+  }
+
+  toggle() {
+    this.playing = !this.playing;
+    if (this.playing && this.t_ns >= this.stop_ns) this.t_ns = this.start_ns;
+    this.last_ms = null;
+  }
+
+  pause() {
+    this.playing = false;
+    this.last_ms = null;
+  }
+
+  // Move to the time of an animation frame, if what belongs there is loaded; whether it moved.
+  tick(now_ms, isReadyAt) {
+    const passed_ms = this.last_ms === null ? 0 : now_ms - this.last_ms;
+    this.last_ms = this.playing ? now_ms : null;
+    if (!this.playing || passed_ms <= 0) return false;
+    // A tab that was in the background does not jump.
+    const next_ns = this.t_ns + Math.min(passed_ms, LONGEST_STEP_MS) * 1e6 * this.speed;
+    if (!isReadyAt(Math.min(next_ns, this.stop_ns))) return false;
+    this.seek(next_ns);
+    if (this.t_ns >= this.stop_ns) this.pause();
+    return true;
+  }
+}
+
+const VIEW_NUMBERS = 3;
+
+function names(text) {
+  return text === null ? null : text.split(",").filter((name) => name);
+}
+
+function span(text) {
+  const [from_ns, to_ns] = (text ?? "").split("~").map(parseSeconds);
+  return Number.isFinite(from_ns) && Number.isFinite(to_ns) && from_ns < to_ns ? [from_ns, to_ns] : null;
+}
+
+function numbers(text) {
+  const found = (text ?? "").split("~").map(Number);
+  return text && found.length === VIEW_NUMBERS && found.every(Number.isFinite) ? found : null;
+}
+
+// What is absent or not understood is null, which means the default.
+export function parseState(query) {
+  const fields = new URLSearchParams(query);
+  const speed = Number(fields.get("speed") ?? 1);
+  return {
+    at_ns: parseSeconds(fields.get("at")),
+    cameras: names(fields.get("cameras")),
+    signals: names(fields.get("signals")),
+    zoom_ns: span(fields.get("zoom")),
+    view: numbers(fields.get("view")),
+    raw: fields.get("raw") === "1",
+    hidden: names(fields.get("hide")) ?? [],
+    speed: speed >= 0.25 && speed <= 4 ? speed : 1,
+  };
+}
+
+export function formatState({ at_ns, cameras, signals, zoom_ns, view, raw, hidden, speed }) {
+  const fields = [["at", secondsText(at_ns)]];
+  if (cameras) fields.push(["cameras", cameras.join(",")]);
+  if (signals) fields.push(["signals", signals.join(",")]);
+  if (zoom_ns) fields.push(["zoom", zoom_ns.map(secondsText).join("~")]);
+  if (view) fields.push(["view", view.map((value) => Number(value.toFixed(3))).join("~")]);
+  if (raw) fields.push(["raw", "1"]);
+  if (hidden?.length) fields.push(["hide", hidden.join(",")]);
+  if (speed && speed !== 1) fields.push(["speed", String(speed)]);
+  // Commas and tildes are allowed in a query and easier to read than their escapes.
+  return fields.map(([name, value]) => `${name}=${encodeURIComponent(value).replaceAll("%2C", ",")}`).join("&");
 }

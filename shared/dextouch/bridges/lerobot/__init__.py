@@ -1,12 +1,7 @@
 """Import of LeRobotDataset v2 and v3, and export of v3.0."""
 
-from dextouch.bridges.lerobot.exporting import (
-    DatasetExport,
-    ExportOptions,
-    export_dataset,
-    export_lerobot,
-)
-from dextouch.bridges.lerobot.importing import DatasetImport, import_dataset, import_lerobot
+from dextouch.bridges.lerobot.exporting import DatasetExport, ExportOptions, export_dataset
+from dextouch.bridges.lerobot.importing import DatasetImport, import_dataset
 from dextouch.bridges.lerobot.recordings import ImportOptions
 
 __all__ = [
@@ -15,7 +10,5 @@ __all__ = [
     "ExportOptions",
     "ImportOptions",
     "export_dataset",
-    "export_lerobot",
     "import_dataset",
-    "import_lerobot",
 ]

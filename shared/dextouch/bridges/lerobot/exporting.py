@@ -79,17 +79,6 @@ class DatasetExport:
     num_touch_left_out: int = 0
 
 
-def export_lerobot(
-    readers: Iterable[EpisodeReader],
-    folder: Path,
-    *,
-    repo_id: str,
-    options: ExportOptions = DEFAULTS,
-) -> int:
-    """Write episodes as one LeRobotDataset, as `export_dataset`; returns the number of frames."""
-    return export_dataset(readers, folder, repo_id=repo_id, options=options).num_frames
-
-
 def export_dataset(
     readers: Iterable[EpisodeReader],
     folder: Path,
@@ -182,7 +171,6 @@ class _ParquetFiles:
         self._writer: pq.ParquetWriter | None = None
 
     def append(self, table: pa.Table) -> int:
-        """Write a table and return the number of its file."""
         with disk_errors(f"write a table of {self._folder}"):
             if self._writer is None or self._path.stat().st_size >= self._file_bytes:
                 self.close()
@@ -367,7 +355,6 @@ class _Dataset:
             self._rows = []
 
     def result(self, present: tuple[str, ...]) -> DatasetExport:
-        """The counts of the new episodes."""
         num_frames, num_episodes = self.num_frames, self._num_episodes
         if self._before is not None:
             num_frames -= self._before.num_frames

@@ -21,18 +21,16 @@ from dextouch.bridges.foreign import (
     stream_names,
 )
 from dextouch.bridges.lerobot import layout
-from dextouch.bridges.lerobot.feature_streams import (
+from dextouch.bridges.lerobot.layout import WORLD
+from dextouch.bridges.lerobot.recordings import (
     COUNTERS,
     TASK_INDEX,
     Frames,
-    camera_stream,
-    feature_streams,
-)
-from dextouch.bridges.lerobot.layout import WORLD
-from dextouch.bridges.lerobot.recordings import (
     ImportOptions,
+    camera_stream,
     dataset_contradictions,
     dataset_id,
+    feature_streams,
     recordings_importer,
 )
 from dextouch.bridges.lerobot.source import (
@@ -106,29 +104,16 @@ class DatasetImport:
 
     def _lines(self) -> Iterator[str]:
         yield from self.notes
-        told: set[str] = set()
+        printed: set[str] = set()
         for report in self.reports:
             head, *rest = report.lines()
             yield head if report.imported else report.recording_id
-            about = ("  refused", "  contradiction")
-            fresh = [one for one in rest if not told or one.startswith(about)]
-            yield from (one for one in fresh if one not in told)
-            told.update(rest)
+            kinds_of_problems = ("  refused", "  contradiction")
+            new_lines = [one for one in rest if not printed or one.startswith(kinds_of_problems)]
+            yield from (one for one in new_lines if one not in printed)
+            printed.update(rest)
         if self.present:
             yield f"{len(self.present)} episodes of these files are in the store already"
-
-
-def import_lerobot(
-    folder: Path, store: EpisodeStore, *, options: ImportOptions = DEFAULTS
-) -> list[str]:
-    """Write every episode of a dataset into the store and return the ids, as `import_dataset`.
-
-    Raises also if some episodes fail, when the others are written: the first error.
-    """
-    result, error = _import(folder, store, options)
-    if error is not None:
-        raise error
-    return result.ids
 
 
 def import_dataset(
@@ -150,29 +135,37 @@ def import_dataset(
         LimitExceededError: larger than the limits of this reader.
         ConflictError: an id exists already.
     """
-    result, error = _import(folder, store, options)
-    if error is not None and not (result.ids or result.present):
-        raise error
+    source = LeRobotFolder(folder)
+    result, import_one = _importer(source, store, options)
+    errors = []
+    for entry in source.episodes:
+        try:
+            import_one(entry)
+        except DexTouchError as error:
+            result.failed[f"episode {entry.index}"] = error.message
+            errors.append(error)
+    if errors and not (result.ids or result.present):
+        raise errors[0]
     return result
 
 
-def _import(
-    folder: Path, store: EpisodeStore, options: ImportOptions
-) -> tuple[DatasetImport, DexTouchError | None]:
-    """What came in, and the first error of an episode."""
-    source = LeRobotFolder(folder)
+def _importer(
+    source: LeRobotFolder, store: EpisodeStore, options: ImportOptions
+) -> tuple[DatasetImport, Callable[[EpisodeEntry], None]]:
+    """The result, still empty, and what adds an episode to it."""
+    folder = source.folder
     first = source.sidecar(source.episodes[0]) if source.episodes else None
     features, missing = _map_features(source.info, options.mapping, _tactile_layout(first))
     if first is None and missing:
         result = DatasetImport("recording", notes=[f"imported as recordings: {'; '.join(missing)}"])
         write = recordings_importer(source, store, options)
 
-        def import_one(entry: EpisodeEntry) -> None:
+        def import_recording(entry: EpisodeEntry) -> None:
             report = write(entry)
             (result.ids if report.imported else result.present).append(report.recording_id)
             result.reports += [report] if report.imported else []
 
-        return result, _import_each(source, import_one, result)
+        return result, import_recording
     if missing:
         raise InvalidInputError(f"{folder}: an export of DexTouch that is changed: {missing}")
     if options.fps is not None:
@@ -191,21 +184,7 @@ def _import(
             result.ids.append(report.recording_id)
             result.reports.append(report)
 
-    return result, _import_each(source, import_episode, result)
-
-
-def _import_each(
-    source: LeRobotFolder, import_one: Callable[[EpisodeEntry], None], result: DatasetImport
-) -> DexTouchError | None:
-    """Try every episode once; returns the first error."""
-    first = None
-    for entry in source.episodes:
-        try:
-            import_one(entry)
-        except DexTouchError as error:
-            result.failed[f"episode {entry.index}"] = error.message
-            first = first or error
-    return first
+    return result, import_episode
 
 
 def _import_episode(
@@ -241,8 +220,8 @@ def _import_episode(
     report = ImportReport(attributes.episode_id, whole_text(source.folder.name), refused=refused)
     report.imported = _store(store, attributes, content, features)
     if sidecar is not None:
-        told = [f"{one.source}: {note}" for one in report.imported for note in one.notes]
-        result.notes += [note for note in told if note not in result.notes]
+        notes = [f"{one.source}: {note}" for one in report.imported for note in one.notes]
+        result.notes += [note for note in notes if note not in result.notes]
         report.imported = []
     return report
 
@@ -394,42 +373,35 @@ def _store(
     features: Mapping[str, str],
 ) -> list[ImportedStream]:
     """Write an episode into the store, atomically."""
-    told = []
+    imported = []
     with store.writer(attributes=attributes) as writer:
-
-        def add(name: str, **properties: object) -> None:
-            known = {"name": name, "nominal_rate_hz": attributes.model_rate_hz, **properties}
-            writer.add_stream(StreamDescriptor.model_validate(known))
-
         for name, (kind, unit, values, keep) in content.numbers.items():
-            more = {}
+            fields: dict[str, object] = {"name": name, "kind": kind, "unit": unit}
+            fields |= {"shape": values.shape[1:], "dtype": str(values.dtype)}
+            fields |= {"nominal_rate_hz": attributes.model_rate_hz}
             if kind == "tactile" and content.tactile_layout != DEXTOUCH_V1:
-                more["layout"] = content.tactile_layout
-            t_ns, shape, role = content.t_ref_ns[keep], values.shape[1:], name.partition("_")[0]
-            add(name, kind=kind, shape=shape, dtype=str(values.dtype), unit=unit, **more)
+                fields["layout"] = content.tactile_layout
+            about, t_ns = StreamDescriptor.model_validate(fields), content.t_ref_ns[keep]
+            writer.add_stream(about)
             writer.append(name, values=values[keep], t_ref_ns=t_ns)
-            one = ImportedStream(name, features[role], kind, unit, shape, None)
-            told.append(_timed(one, [t_ns]))
+            imported.append(_timed(about, features[name.partition("_")[0]], [t_ns]))
         for stream in content.others:
             about, stamps = stream.descriptor, []
             writer.add_stream(about)
             for block in stream.blocks:
                 writer.append(about.name, values=block.values, t_ref_ns=block.t_ns)
                 stamps.append(block.t_ns)
-            one = ImportedStream(
-                about.name, stream.source, about.kind, about.unit, about.shape, about.frame
-            )
-            one.notes = tuple(stream.notes)
-            told.append(_timed(one, stamps))
-    return told
+            imported.append(_timed(about, stream.source, stamps, stream.notes))
+    return imported
 
 
-def _timed(stream: ImportedStream, stamps_ns: Sequence[np.ndarray]) -> ImportedStream:
-    t_ns = np.concatenate(stamps_ns)
-    stream.num_samples = len(t_ns)
-    stream.duration_s = float(np.ptp(t_ns)) / 1e9
-    stream.rate_hz = (len(t_ns) - 1) / stream.duration_s if stream.duration_s else 0.0
-    return stream
+def _timed(
+    about: StreamDescriptor, source: str, stamps_ns: Sequence[np.ndarray], notes: Sequence[str] = ()
+) -> ImportedStream:
+    one, t_ns = ImportedStream.of(about, source), np.concatenate(stamps_ns)
+    one.num_samples, one.notes = len(t_ns), tuple(notes)
+    one.set_span(int(t_ns.min()), int(t_ns.max()))
+    return one
 
 
 def _columns(
@@ -512,10 +484,7 @@ def _known_attributes(
 
 
 def _foreign_attributes(
-    source: LeRobotFolder,
-    entry: EpisodeEntry,
-    anchor: AnchorPoses | None,
-    options: ImportOptions,
+    source: LeRobotFolder, entry: EpisodeEntry, anchor: AnchorPoses | None, options: ImportOptions
 ) -> dict[str, object]:
     name = whole_text(source.folder.resolve().name)
     digest = file_sha256(source.data_file(entry))

@@ -236,7 +236,7 @@ def frames_of(reader: EpisodeReader, cameras: Sequence[str], fps: int) -> Episod
     state = actions_from_poses(
         poses_from_actions(measured, reader.attributes.anchor.to_poses()), WORLD
     )
-    kpa, valid = _tactile(reader, t_ns)
+    kpa, valid = _touch_means(reader, t_ns)
     indices, offsets_ns = {}, np.zeros((len(t_ns), len(cameras)), dtype=np.int64)
     for column, camera in enumerate(cameras):
         stamps = _image_stamps(reader, camera)
@@ -302,28 +302,30 @@ def _at(
     return actions_from_poses(between, anchor)
 
 
-def _tactile(
+def _touch_means(
     reader: EpisodeReader, t_ns: np.ndarray
 ) -> tuple[Float32[np.ndarray, "n 2 taxels"], Bool[np.ndarray, "n 2"]]:
     kpa = np.zeros((len(t_ns), 2, reader.tactile_layout.num_taxels), dtype=np.float32)
     valid = np.zeros((len(t_ns), 2), dtype=bool)
-    for hand, side in enumerate(SIDES):
-        name = f"tactile_{side}"
-        if name in reader.streams:
-            data = reader.read(name)
-            ranges = step_ranges(data.t_ref_ns, t_ns, 0, len(t_ns))
-            kpa[:, hand], valid[:, hand] = mean_over_ranges(data.values, ranges)
+    for hand, name, ranges in _touch_ranges(reader, t_ns):
+        kpa[:, hand], valid[:, hand] = mean_over_ranges(reader.read(name).values, ranges)
     return kpa, valid
+
+
+def _touch_ranges(
+    reader: EpisodeReader, t_ns: np.ndarray
+) -> Iterator[tuple[int, str, Int64[np.ndarray, "n 2"]]]:
+    """Number and stream of each hand with touch, and its samples since the frame before."""
+    for hand, name in enumerate(f"tactile_{side}" for side in SIDES):
+        if name in reader.streams:
+            yield hand, name, step_ranges(reader.stamps_ns(name), t_ns, 0, len(t_ns))
 
 
 def touch_counts(reader: EpisodeReader, t_ns: np.ndarray) -> Int64[np.ndarray, "n 2"]:
     """Number of touch samples of each hand in each frame, since the frame before."""
     counts = np.zeros((len(t_ns), 2), dtype=np.int64)
-    for hand, side in enumerate(SIDES):
-        name = f"tactile_{side}"
-        if name in reader.streams:
-            ranges = step_ranges(reader.stamps_ns(name), t_ns, 0, len(t_ns))
-            counts[:, hand] = ranges[:, 1] - ranges[:, 0]
+    for hand, _, ranges in _touch_ranges(reader, t_ns):
+        counts[:, hand] = ranges[:, 1] - ranges[:, 0]
     return counts
 
 
@@ -337,13 +339,9 @@ def touch_samples(
     shape = (len(t_ns), num_samples, 2)
     kpa = np.zeros((*shape, reader.tactile_layout.num_taxels), dtype=np.float32)
     offsets_ns = np.zeros(shape, dtype=np.int64)
-    for hand, side in enumerate(SIDES):
-        name = f"tactile_{side}"
-        if name not in reader.streams:
-            continue
+    for hand, name, ranges in _touch_ranges(reader, t_ns):
         data = reader.read(name)
-        ranges = step_ranges(data.t_ref_ns, t_ns, 0, len(t_ns)).tolist()
-        for frame, (low, high) in enumerate(ranges):
+        for frame, (low, high) in enumerate(ranges.tolist()):
             first = max(low, high - num_samples)
             kpa[frame, : high - first, hand] = data.values[first:high]
             offsets_ns[frame, : high - first, hand] = data.t_ref_ns[first:high] - t_ns[frame]

@@ -169,10 +169,7 @@ class LeRobotFolder:
         """One feature's column [n, *shape] of an episode, whatever its type; as `columns`."""
         path = self.data_file(entry)
         return _column_values(
-            self.rows(entry),
-            name,
-            self.info.features[name].shape,
-            f"{path}: episode {entry.index}",
+            self.rows(entry), name, self.info.features[name].shape, f"{path}: episode {entry.index}"
         )
 
     def rows(self, entry: EpisodeEntry) -> pa.Table:
@@ -470,8 +467,8 @@ def _read_table(
         # Repeated texts stay one, whatever their number.
         with pq.ParquetFile(path, memory_map=True, read_dictionary=texts) as file:
             present = file.schema_arrow.names
-            asked = present if columns is None else columns
-            wanted = [c for c in asked if c in present and c not in leave_out]
+            requested = present if columns is None else columns
+            wanted = [c for c in requested if c in present and c not in leave_out]
             # Columns of lists and structures have a path that goes on after their name.
             starts = tuple(f"{column}." for column in wanted)
             chosen = [k for k, leaf in enumerate(leaves) if f"{leaf.path}.".startswith(starts)]

@@ -1,8 +1,8 @@
-from .catalog_erasure import CATALOG_FOLDER as CATALOG_FOLDER
-from .catalog_erasure import remove_catalog as remove_catalog
+from .deletion import CATALOG_FOLDER as CATALOG_FOLDER
 from .deletion import DeletionRequest as DeletionRequest
 from .deletion import delete_for_good as delete_for_good
 from .deletion import plan_deletion as plan_deletion
+from .deletion import remove_catalog as remove_catalog
 from .deletion import reviews_by as reviews_by
 from .deletion_records import Covered as Covered
 from .deletion_records import DeletionRecords as DeletionRecords
@@ -12,13 +12,11 @@ from .repair import LEFT as LEFT
 from .repair import UPLOADS as UPLOADS
 from .repair import Finding as Finding
 from .repair import ItemReport as ItemReport
-from .repair import Progress as Progress
 from .repair import RepairReport as RepairReport
 from .repair import inspect_group as inspect_group
-from .repair import inspect_stage as inspect_stage
+from .repair import inspect_unfinished as inspect_unfinished
 from .repair import inspect_upload as inspect_upload
 from .repair import is_held as is_held
 from .repair import open_contents as open_contents
 from .repair import repair_group as repair_group
 from .repair import repair_uploads as repair_uploads
-from .repair import unfinished_folders as unfinished_folders

@@ -8,15 +8,16 @@ remembered (`dextouch.episodes.care.deletion_records`), so that stations remove 
 import json
 import os
 import re
-from collections.abc import Callable, Iterable, Sequence
-from contextlib import suppress
+import sqlite3
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import closing, suppress
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Final
 
 from pydantic import BaseModel, Field, ValidationError
 
-from dextouch.episodes.care.catalog_erasure import erase_from_catalog, search_catalog
 from dextouch.episodes.care.deletion_records import DeletionRecords, TakeFacts
 from dextouch.episodes.care.item_facts import (
     PLACES,
@@ -30,12 +31,8 @@ from dextouch.episodes.care.item_facts import (
 )
 from dextouch.episodes.files import disk_errors, held_folder, replace_file, try_lock
 from dextouch.episodes.format import Kind, sha256_hex
-from dextouch.episodes.stages import DOWNLOADS, sweep_downloads
-from dextouch.episodes.trash import (
-    TRASH,
-    put_into_trash,
-    remove_for_good,
-)
+from dextouch.episodes.stages import DOWNLOADS, sweep_stages
+from dextouch.episodes.trash import TRASH, put_into_trash, remove_for_good
 from dextouch.errors import CorruptDataError, InvalidInputError, NotFoundError
 from dextouch.free_text import texts_in
 from dextouch.frozen_model import FrozenModel
@@ -193,7 +190,9 @@ def plan_deletion(
             if reason is None:
                 continue
             waiting.remove(facts)
-            found.append(_victim(facts, reason))
+            of_take = (facts.station, facts.started) if facts.kind == "recording" else (None, "")
+            identity = (facts.kind, facts.item_id, facts.place, facts.folder.name, facts.sha256)
+            found.append(Victim(*identity, reason, *of_take))
             if spreads:
                 grown = True
                 wanted.add(facts.kind, facts.item_id, facts.sha256)
@@ -229,7 +228,6 @@ class _Wanted:
             self.names.setdefault((kind, item_id), set()).update(known)
 
     def stored(self, kind: str, item_id: str) -> set[str]:
-        """Hashes of all items of an id."""
         return self._stored.get((kind, item_id), set())
 
     def is_other(self, kind: str, item_id: str, sha256: str | None) -> bool:
@@ -245,12 +243,6 @@ class _Wanted:
             return hashes is not None
         # The hash of the item is not known, and this is not the one of another stored item.
         return not hashes and sha256 not in self.stored(kind, item_id)
-
-
-def _victim(facts: Facts, reason: str) -> Victim:
-    of_take = (facts.station, facts.started) if facts.kind == "recording" else (None, "")
-    identity = (facts.kind, facts.item_id, facts.place, facts.folder.name, facts.sha256)
-    return Victim(*identity, reason, *of_take)
 
 
 def reviews_by(root: Path, request: DeletionRequest) -> list[Facts]:
@@ -334,7 +326,7 @@ def delete_for_good(
     wanted = IdentifierSearch(words)
     erase_from_catalog(root, wanted.in_column)
     with disk_errors("remove downloads"):
-        sweep_downloads(root)
+        sweep_stages(root, [DOWNLOADS])
     remaining, unreadable, num_files = _search(root, wanted, checkpoints, skip=path)
     deleted = [v for v in known if not (root / v.place / v.folder).exists()]
     receipt = DeletionReceipt(
@@ -500,3 +492,94 @@ def _read_intent(path: Path, root: Path, request: DeletionRequest) -> _Intent:
         raise CorruptDataError(
             f"deletion: {path} is damaged ({error}); remove it and repeat the deletion"
         ) from error
+
+
+# Databases of the tables of `services.episode_store`; any other file there is removed as a whole,
+# since the catalog is made anew from the items.
+CATALOG_FOLDER: Final = ".catalog"
+Search = Callable[[str], list[str]]
+_BUSY_S: Final = 10.0
+_JOURNALS: Final = ("-wal", "-shm", "-journal")
+
+
+def remove_catalog(path: Path) -> None:
+    """Remove a database with its journals; processes that have it open do not notice."""
+    for suffix in ("", *_JOURNALS):
+        path.with_name(path.name + suffix).unlink(missing_ok=True)
+
+
+def erase_from_catalog(root: Path, search: Search) -> None:
+    """Delete the rows in which a search finds something, from the free pages and journals, too.
+
+    What is not a catalog of this release, is damaged or stays locked is removed, and so are other
+    files there, such as the journal of a catalog that is gone.
+    """
+    with disk_errors("erase from the catalog"):
+        for path in _other_files(root):
+            path.unlink(missing_ok=True)
+        for path in _databases(root):
+            try:
+                _erase_rows(path, search)
+            except sqlite3.Error:
+                remove_catalog(path)
+
+
+def _erase_rows(path: Path, search: Search) -> None:
+    with closing(sqlite3.connect(path, timeout=_BUSY_S, isolation_level=None)) as connection:
+        connection.execute("PRAGMA secure_delete = ON")
+        connection.execute("BEGIN IMMEDIATE")
+        rows = connection.execute("SELECT item.row, * FROM item LEFT JOIN body USING (row)")
+        found = [(row,) for row, *values in rows if _named(values, search)]
+        connection.executemany("DELETE FROM item WHERE row = ?", found)
+        connection.execute("COMMIT")
+        connection.execute("VACUUM")
+        (is_busy, *_) = connection.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchone()
+    if is_busy:
+        raise sqlite3.OperationalError("its journal is in use")
+
+
+def search_catalog(root: Path, search: Search) -> Iterator[tuple[str, tuple[str, ...]]]:
+    """Tables in which a search finds something, with what it finds."""
+    with disk_errors("search the catalog"):
+        for path in _other_files(root):
+            yield f"{CATALOG_FOLDER}/{path.name} is of no catalog; remove it, and repeat", ()
+        for path in _databases(root):
+            where = f"{CATALOG_FOLDER}/{path.name}"
+            try:
+                for table, found in _search_tables(path, search):
+                    yield f"{where} {table}", found
+            except sqlite3.Error as error:
+                # It held nothing that could be erased when this began.
+                yield f"{where} cannot be searched ({error}); remove it, and repeat", ()
+
+
+def _search_tables(path: Path, search: Search) -> Iterator[tuple[str, tuple[str, ...]]]:
+    with closing(sqlite3.connect(path, timeout=_BUSY_S)) as connection:
+        tables = connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")
+        for (table,) in tables.fetchall():
+            columns = connection.execute(f'PRAGMA table_info("{table}")').fetchall()
+            texts = ", ".join(f'"{name}"' for _, name, kind, *_ in columns if kind == "TEXT")
+            if texts:
+                rows = connection.execute(f'SELECT {texts} FROM "{table}"')  # noqa: S608
+                if found := {name for row in rows for name in _named(row, search)}:
+                    yield table, tuple(sorted(found))
+
+
+def _named(values: Iterable[object], search: Search) -> set[str]:
+    texts = (value for value in values if isinstance(value, str))
+    return {name for text in texts for name in search(text)}
+
+
+def _databases(root: Path) -> list[Path]:
+    return sorted((root / CATALOG_FOLDER).glob("*.sqlite"))
+
+
+def _other_files(root: Path) -> list[Path]:
+    """Files in the folder that are neither a database nor one of its journals."""
+    folder, found = root / CATALOG_FOLDER, []
+    for path in sorted(folder.iterdir()) if folder.is_dir() else []:
+        base, dash, _ = path.name.rpartition("-")
+        owner = base if dash and path.name.removeprefix(base) in _JOURNALS else path.name
+        if path.is_file() and not (owner.endswith(".sqlite") and (folder / owner).is_file()):
+            found.append(path)
+    return found

@@ -1,12 +1,8 @@
-"""Inspection of a store for damage, and repair from an intact copy or by salvage of what is whole.
-
-A reader stops at the first damage; an inspection continues and lists all of it. Repairing is
-reversible: damaged groups go to the trash, from where they can be restored.
-"""
+"""Inspection of a store for damage, and repair from a copy or by salvage of what is whole."""
 
 import json
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -84,8 +80,6 @@ from dextouch.schemas import (
 
 UPLOADS = HOMES["upload"]
 Group = GroupContents[EpisodeAttributes] | GroupContents[RecordingAttributes]
-# Called after every storage chunk with the number of bytes read.
-Progress = Callable[[int], None]
 WHOLE, REPAIRED, SALVAGED, LEFT = "whole", "repaired", "salvaged", "left"
 LOST = "lost_to_damage"
 
@@ -125,9 +119,7 @@ def open_contents(files: GroupFiles, kind: Kind) -> Group:
     return read_group(files, RecordingAttributes)
 
 
-def inspect_group(
-    files: GroupFiles, kind: Kind, *, progress: Progress = lambda _: None
-) -> ItemReport:
+def inspect_group(files: GroupFiles, kind: Kind) -> ItemReport:
     """Read a committed group completely and list all damage.
 
     Raises NotFoundError if there is no such group, or it was deleted meanwhile.
@@ -139,16 +131,13 @@ def inspect_group(
             raise NotFoundError(f"{kind} {files.item_id!r}: was deleted") from error
         return ItemReport(kind, files.item_id, findings=(Finding(error.message),))
     sizes: list[int] = []
-
-    def count(size: int) -> None:
-        sizes.append(size)
-        progress(size)
-
-    findings = [
-        Finding(error.message, name, number, _image_of(error))
-        for name in contents.entries
-        for number, error in contents.inspect_array(name, progress=count)
-    ]
+    findings = []
+    for name in contents.entries:
+        for number, damage in contents.inspect_array(name, progress=sizes.append):
+            image = damage.details.get("image")
+            findings.append(
+                Finding(damage.message, name, number, image if isinstance(image, int) else None)
+            )
     if not findings:
         findings += _stamp_findings(contents)
     if isinstance(files, LocalGroup):
@@ -159,11 +148,6 @@ def inspect_group(
     if findings:
         contents.opened.check_present()
     return ItemReport(kind, files.item_id, len(contents.entries), sum(sizes), tuple(findings))
-
-
-def _image_of(error: StorageError) -> int | None:
-    image = error.details.get("image")
-    return image if isinstance(image, int) else None
 
 
 def _stamp_findings(contents: Group) -> list[Finding]:
@@ -244,11 +228,6 @@ def _inspect_batches(folder: Path, names: list[str]) -> ItemReport:
     return ItemReport("upload", folder.name, len(names), num_bytes, tuple(findings), busy)
 
 
-def inspect_stage(folder: Path, kind: str = "stage") -> ItemReport:
-    """Say whether a stage or download is a running one; a sweep removes it otherwise."""
-    return ItemReport(kind, folder.name, busy=is_held(folder))
-
-
 def is_held(folder: Path) -> bool:
     """Whether a writer holds the lock of a stage or a spool."""
     with disk_errors(f"look at {folder.name}"):
@@ -258,13 +237,25 @@ def is_held(folder: Path) -> bool:
     return lock is None
 
 
-def unfinished_folders(root: Path) -> Iterator[tuple[str, Path]]:
-    """Kind and folder of every upload, stage and download below a store's folder."""
+def inspect_unfinished(root: Path) -> Iterator[ItemReport]:
+    """Inspect every upload, stage and download below a store's folder."""
     for kind, name in (("upload", UPLOADS), ("stage", STAGING), ("download", DOWNLOADS)):
         folder = root / name
         with disk_errors(f"list {name}"):
             paths = sorted(folder.iterdir()) if folder.is_dir() else []
-        yield from ((kind, path) for path in paths if not is_system_file(path.name))
+        for path in paths:
+            if is_system_file(path.name):
+                continue
+            if not path.is_dir() or path.is_symlink():
+                finding = Finding(
+                    f"{kind} {path.name}: is not a folder; move it away", foreign=True
+                )
+                yield ItemReport(kind, path.name, findings=(finding,))
+            elif kind == "upload":
+                yield inspect_upload(path)
+            else:
+                # Where it is not busy, a sweep removes it.
+                yield ItemReport(kind, path.name, busy=is_held(path))
 
 
 @dataclass(frozen=True)

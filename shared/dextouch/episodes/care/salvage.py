@@ -15,7 +15,7 @@ import google_crc32c
 import numpy as np
 import zstandard
 
-from dextouch.episodes.encoded_images import GroupChunks
+from dextouch.episodes.encoded_images import GroupChunks, hashed_bytes
 from dextouch.episodes.files import LocalFile
 from dextouch.episodes.format import (
     GOP_IMAGES,
@@ -28,7 +28,6 @@ from dextouch.episodes.format import (
     shard_path,
 )
 from dextouch.episodes.image_codecs import ImageGroups
-from dextouch.episodes.inspection import hashed_bytes
 from dextouch.episodes.shards import CRC_BYTES, INDEX_ENTRY_BYTES, ShardReader
 from dextouch.episodes.spool_log import body_at, find_records, open_log, read_batch, read_seal
 from dextouch.errors import CorruptDataError, InvalidInputError
@@ -212,15 +211,6 @@ def _read_rows(
     }
 
 
-def _whole_groups(kept: np.ndarray, size: int) -> np.ndarray:
-    """Keep or drop whole groups of pictures, since their images depend on each other."""
-    starts = np.arange(0, len(kept), size)
-    if not len(starts):
-        return kept
-    whole = np.logical_and.reduceat(kept, starts)
-    return np.repeat(whole, size)[: len(kept)]
-
-
 def on_one_grid(streams: Sequence[SalvagedStream]) -> list[SalvagedStream]:
     """Keep the longest gap-free run of the model grid, since steps are addressed by number."""
     grid = [stream for stream in streams if stream.descriptor.name in GRID_STREAMS]
@@ -263,8 +253,10 @@ def _spooled(
     kept = np.zeros(max(int(ends[-1]) if len(rows) else 0, num_sealed), dtype=bool)
     for row in rows:
         kept[int(row["first_sample"]) :][: int(row["num_samples"])] = True
-    if image_codec(descriptor) == "h264":
-        kept = _whole_groups(kept, GOP_IMAGES)
+    if image_codec(descriptor) == "h264" and len(kept):
+        # Whole groups of pictures, since their images depend on each other.
+        whole = np.logical_and.reduceat(kept, np.arange(0, len(kept), GOP_IMAGES))
+        kept = np.repeat(whole, GOP_IMAGES)[: len(kept)]
 
     def read(start: int, stop: int, wanted: np.ndarray) -> Block:
         inside = rows[(rows["first_sample"] < stop) & (ends > start)]

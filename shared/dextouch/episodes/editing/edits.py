@@ -1,28 +1,59 @@
-"""What all edits share: the id and lineage of the result, and what becomes of the source.
+"""Relabels, notes on time ranges, and what all edits share: id and lineage of the result.
 
 The source is marked as superseded before the result is committed, and the mark counts only while
 the result is in the store (`Review.standing`): the commit alone switches from one to the other.
 """
 
+import json
+import shlex
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from functools import partial
 
-from pydantic import BaseModel
+from pydantic import BaseModel, ValidationError
 
-from dextouch.episodes.format import Attributes, Kind, attributes_id, check_id, numbered_ids
+from dextouch.episodes.care import DeletionRecords
+from dextouch.episodes.files import GroupFiles
+from dextouch.episodes.format import (
+    ATTRIBUTES_KEY,
+    COMMIT_FILE,
+    METADATA_FILE,
+    Attributes,
+    Kind,
+    attributes_id,
+    canonical_json,
+    check_id,
+    numbered_ids,
+    sha256_hex,
+)
 from dextouch.episodes.reader import EpisodeReader, RecordingReader
 from dextouch.episodes.store import EpisodeStore
 from dextouch.episodes.trash import CLICKS_FILE, NOTES_FILE, REVIEW_FILE
 from dextouch.episodes.writer import EpisodeWriter
-from dextouch.errors import ConflictError, InvalidInputError, StorageError, UnknownNameError
+from dextouch.errors import (
+    ConflictError,
+    CorruptDataError,
+    InvalidInputError,
+    LimitExceededError,
+    NotFoundError,
+    StorageError,
+    UnknownNameError,
+)
+from dextouch.free_text import check_line
 from dextouch.schemas import (
+    MAX_NOTES,
     EditedItem,
     EditedOutcome,
+    EpisodeAttributes,
     EpisodeClicks,
     ItemNotes,
     LineageEntry,
+    NewNote,
+    TimedNote,
+    first_problems,
+    json_ready,
     superseded,
 )
 
@@ -111,7 +142,12 @@ class Edit:
         """Write the result with `write`, unless that is done, and put the source away."""
         if not self.options.dry_run:
             if not self.is_done:
-                self._mark_sources()
+                # Also all that the source was edited from, and what of it is in the trash.
+                change = partial(superseded, by=self.new_id)
+                for entry in self.lineage:
+                    if entry.is_edit and entry.kind == self.kind:
+                        is_held = entry == self.source
+                        self.store.change_source_review(entry, change, is_held=is_held)
                 with self.store.writer(kind=self.kind, attributes=attributes) as writer:
                     write(writer)
                     for name, remark in remarks.items():
@@ -119,27 +155,19 @@ class Edit:
                             writer.add_remark(name, remark)
             if self._to_trash:
                 self.store.delete(self.source_id, kind=self.kind)
+        written = not self.options.dry_run
+        result = self.store.open_item(self.kind, self.new_id) if written else None
         return EditedItem(
             kind=self.kind,
             source_id=self.source_id,
             source_sha256=self.reader.content_sha256,
             id=self.new_id,
-            sha256=None if self.options.dry_run else self._content_of_result(),
+            sha256=None if result is None else result.content_sha256,
             operation=self.operation,
             num_samples=dict(num_samples),
             messages=tuple(self.messages),
             source_is="in the trash" if self._to_trash else "superseded",
         )
-
-    def _mark_sources(self) -> None:
-        """Mark the source, and all that it was edited from, also in the trash, as superseded."""
-        change = partial(superseded, by=self.new_id)
-        for entry in self.lineage:
-            if entry.is_edit and entry.kind == self.kind:
-                self.store.change_source_review(entry, change, is_held=entry == self.source)
-
-    def _content_of_result(self) -> str:
-        return self.store.open_item(self.kind, self.new_id).content_sha256
 
     def remarks(
         self,
@@ -164,11 +192,7 @@ class Edit:
             if clicks is not None and not clicks_hold:
                 self.messages.append("the clicks are on another first image and are left out")
                 clicks = None
-        return {
-            REVIEW_FILE: review,
-            NOTES_FILE: kept if kept.notes else None,
-            CLICKS_FILE: clicks,
-        }
+        return {REVIEW_FILE: review, NOTES_FILE: kept if kept.notes else None, CLICKS_FILE: clicks}
 
 
 def shifted_notes(
@@ -205,3 +229,165 @@ def new_outcome(
     if outcome not in OUTCOMES:
         raise UnknownNameError("outcome", outcome, ["keep", *OUTCOMES])
     return {"success": OUTCOMES[outcome]}
+
+
+def zero_ns(reader: EpisodeReader | RecordingReader) -> int:
+    """Second 0 of an item on its clock: step 0 of an episode, the start of a recording."""
+    if isinstance(reader, EpisodeReader):
+        return int(reader.stamps_ns("action")[0]) if reader.num_steps else 0
+    started_ns = reader.attributes.started_t_host_ns
+    return time_span_ns(reader)[0] if started_ns is None else started_ns
+
+
+def time_span_ns(reader: EpisodeReader | RecordingReader) -> tuple[int, int]:
+    """Stamps of the first and the last sample of an item; raises InvalidInputError without any."""
+    stamps = [reader.stamps_ns(name) for name in reader.streams]
+    ends = [(int(one[0]), int(one[-1])) for one in stamps if len(one)]
+    if not ends:
+        raise InvalidInputError(f"{reader.item_id!r}: has no sample, and no time to speak of")
+    return min(first for first, _ in ends), max(last for _, last in ends)
+
+
+def add_note(
+    store: EpisodeStore, item_id: str, given: NewNote, *, kind: Kind = "episode"
+) -> TimedNote:
+    """Keep a note on an item.
+
+    Raises InvalidInputError for a range that is empty or outside the item, LimitExceededError for
+    more than MAX_NOTES, and as `EpisodeStore.review`.
+    """
+    reader = store.open_item(kind, item_id)
+    first_ns, last_ns = time_span_ns(reader)
+    if not given.start_ns <= given.stop_ns or given.stop_ns < first_ns or given.start_ns > last_ns:
+        zero = zero_ns(reader)
+        got, expected = (
+            f"{(low - zero) / 1e9:.3f} … {(high - zero) / 1e9:.3f} s"
+            for low, high in ((given.start_ns, given.stop_ns), (first_ns, last_ns))
+        )
+        raise InvalidInputError(
+            f"note on {kind} {item_id!r}: got the range {got}, expected one within {expected}"
+        )
+    added: list[TimedNote] = []
+
+    def add(notes: ItemNotes) -> ItemNotes:
+        if len(notes.notes) >= MAX_NOTES:
+            raise LimitExceededError(
+                f"note on {kind} {item_id!r}: it has {MAX_NOTES} notes, expected at most as many; "
+                "remove one first"
+            )
+        number = 1 + max((one.number for one in notes.notes), default=0)
+        added.append(TimedNote(number=number, written_at=datetime.now(UTC), **given.model_dump()))
+        ordered = sorted([*notes.notes, *added], key=lambda one: (one.start_ns, one.number))
+        return ItemNotes(notes=tuple(ordered))
+
+    store.change_notes(item_id, add, kind=kind)
+    return added[0]
+
+
+def remove_note(
+    store: EpisodeStore, item_id: str, number: int, *, kind: Kind = "episode"
+) -> ItemNotes:
+    """Remove a note by its number, and return the others; raises NotFoundError without it."""
+
+    def remove(notes: ItemNotes) -> ItemNotes:
+        kept = tuple(one for one in notes.notes if one.number != number)
+        if len(kept) == len(notes.notes):
+            numbers = ", ".join(str(one.number) for one in notes.notes) or "none"
+            raise NotFoundError(
+                f"note {number} on {kind} {item_id!r}: not there; its notes are {numbers}"
+            )
+        return ItemNotes(notes=kept)
+
+    return store.change_notes(item_id, remove, kind=kind)
+
+
+# Attributes that can be changed, beside the outcome.
+LABELS = ("task", "instruction", "operator")
+
+
+def relabel_item(
+    store: EpisodeStore,
+    item_id: str,
+    changes: Mapping[str, str],
+    *,
+    kind: Kind = "episode",
+    outcome: EditedOutcome | None = None,
+    options: EditOptions = DEFAULTS,
+) -> EditedItem:
+    """Write an item with other attributes, and the same arrays, as a new one, which supersedes it.
+
+    The files of the arrays are shared with the source where the file system can.
+
+    Args:
+        store: where the item is.
+        item_id: of the source.
+        changes: new values of some of `task`, `instruction` and `operator`.
+        kind: of the item.
+        outcome: new outcome; another task must be given one, if the item was judged.
+        options: of all edits.
+
+    Raises:
+        InvalidInputError: nothing changes, a value is invalid, or the outcome is lacking.
+        NotFoundError, CorruptDataError, ConflictError, UnavailableError: as `trim_episode`.
+    """
+    with store.held(item_id, kind=kind):
+        reader = store.open_item(kind, item_id)
+        about = reader.attributes
+        changed = {key: text for key, text in changes.items() if getattr(about, key) != text}
+        operator = changed.get("operator")
+        if operator is not None and DeletionRecords(store.root).has_operator(operator):
+            raise InvalidInputError(
+                f"relabel {kind} {item_id!r}: the operator was permanently deleted from the store, "
+                "expected another, or `dextouch store deletions --readmit` first"
+            )
+        is_other_task = "task" in changed
+        lacking = f"it becomes one of {changed.get('task')!r}" if is_other_task else ""
+        fields: dict[str, object] = {**changed, **new_outcome(about, outcome, lacking=lacking)}
+        if not {key for key, value in fields.items() if getattr(about, key) != value}:
+            raise InvalidInputError(
+                f"{kind} {item_id!r}: nothing changes; expected another --task, --instruction, "
+                "--operator or --outcome than it has"
+            )
+        # Not the pseudonym: the lineage of later items must not name an operator.
+        arguments = {key: "…" if key == "operator" else text for key, text in changed.items()}
+        if outcome is not None:
+            arguments["outcome"] = outcome
+        text = shlex.join(
+            ["relabel", *(part for k, v in arguments.items() for part in (f"--{k}", v))]
+        )
+        edit = Edit(store, reader, "relabelled", text, options, fields)
+        if is_other_task and isinstance(about, EpisodeAttributes) and about.event_times_s:
+            edit.messages.append(f"events of {about.task!r} are left out")
+            fields = {**fields, "event_times_s": {}}
+        fields = fields | {f"{kind}_id": edit.new_id, "lineage": edit.lineage}
+        attributes = about.model_copy(update=fields)
+        try:
+            for value in changed.values():
+                check_line(value)
+            type(about).model_validate(dict(attributes))
+        except ValueError as error:
+            why = first_problems(error) if isinstance(error, ValidationError) else str(error)
+            raise InvalidInputError(f"relabel {kind} {item_id!r}: {why}") from error
+        metadata, commit = with_attributes(store.files(item_id, kind=kind), attributes)
+
+        def write(writer: EpisodeWriter) -> None:
+            files = store.files(item_id, kind=kind)
+            writer.take_files(files, metadata=metadata, commit=commit, link=True)
+
+        counts = {name: reader.num_samples(name) for name in reader.streams}
+        # Its streams are files that exist already.
+        shell = attributes.model_copy(update={"streams": ()})
+        return edit.run(shell, counts, write, edit.remarks(clicks_hold=not is_other_task))
+
+
+def with_attributes(files: GroupFiles, attributes: Attributes) -> tuple[bytes, bytes]:
+    """`zarr.json` and `commit.json` of a group whose arrays stay, with other attributes."""
+    metadata, commit = files.get(METADATA_FILE), files.get(COMMIT_FILE)
+    if metadata is None or commit is None:
+        raise CorruptDataError(f"{files.item_id}: {METADATA_FILE} or {COMMIT_FILE} is missing")
+    group, record = json.loads(metadata), json.loads(commit)["record"]
+    group["attributes"][ATTRIBUTES_KEY] = json_ready(attributes)
+    changed = canonical_json(group)
+    record |= {"id": attributes_id(attributes), "attributes_sha256": sha256_hex(changed)}
+    digest = sha256_hex(canonical_json(record))
+    return changed, canonical_json({"record": record, "sha256": digest})

@@ -1,8 +1,4 @@
-"""Merges of stores: every item of one or more stores copied into another, exactly as it is.
-
-Each item is verified before it is copied, and committed atomically: a merge that was interrupted is
-repeated, and goes on where it stopped.
-"""
+"""Merges of stores: every item of one or more stores copied into another, exactly as it is."""
 
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
@@ -15,7 +11,7 @@ from typing import Literal
 from pydantic import BaseModel
 
 from dextouch.episodes.care import Covered, DeletionRecords, TakeFacts, open_contents
-from dextouch.episodes.editing.relabel import with_attributes
+from dextouch.episodes.editing.edits import with_attributes
 from dextouch.episodes.files import LocalGroup
 from dextouch.episodes.format import (
     COMMIT_FILE,
@@ -92,7 +88,9 @@ def merge_stores(
     """
     reports, origins = [], _Origins(target)
     for source in sources:
-        if source.url == target.url or (source.folders and _same_folder(source, target)):
+        are_folders = source.folders and target.folders
+        is_same = are_folders and source.root.resolve() == target.root.resolve()
+        if source.url == target.url or is_same:
             raise InvalidInputError(f"merge: {source.url} is the store to merge into; name others")
         listed = [(kind, name) for kind in KINDS for name in source.list(kind=kind)]
         if not listed:
@@ -107,10 +105,6 @@ def merge_stores(
             on_item(report)
         run.rename_results()
     return reports
-
-
-def _same_folder(source: EpisodeStore, target: EpisodeStore) -> bool:
-    return bool(target.folders) and source.root.resolve() == target.root.resolve()
 
 
 class _Origins:
@@ -149,7 +143,6 @@ class _Origins:
         return found
 
     def add(self, source: LineageEntry, item: LineageEntry) -> None:
-        """Note an item that was just made."""
         self._found[source.kind, source.sha256 or ""].append(item)
 
     def made_of(self, kind: Kind, sha256: str, other: EpisodeStore) -> LineageEntry | None:
@@ -303,7 +296,7 @@ def _instead(before: Review, after: Review, found: Review | None) -> Review | No
 
 def _or_else(theirs: Review, ours: Review | None) -> Review:
     # A review written meanwhile.
-    return theirs if ours is None else ours
+    return ours or theirs
 
 
 def _or_these(theirs: ItemNotes, ours: ItemNotes) -> ItemNotes:

@@ -9,15 +9,9 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from dextouch.episodes.editing.edits import DEFAULTS, Edit, EditOptions, new_outcome
-from dextouch.episodes.editing.notes import time_span_ns
+from dextouch.episodes.editing.edits import DEFAULTS, Edit, EditOptions, new_outcome, time_span_ns
 from dextouch.episodes.format import GOP_IMAGES, STAMPS
-from dextouch.episodes.reader import (
-    ACTION_STREAMS,
-    SAME_INSTANT_NS,
-    EpisodeReader,
-    RecordingReader,
-)
+from dextouch.episodes.reader import ACTION_STREAMS, SAME_INSTANT_NS, EpisodeReader, RecordingReader
 from dextouch.episodes.store import EpisodeStore
 from dextouch.episodes.validity import interpolated_actions
 from dextouch.episodes.writer import EpisodeWriter

@@ -1,9 +1,7 @@
-"""Loading of a hand model file and its mapping file into a `HandModel` in our wrist frame.
+"""Loading of a hand model file and its mapping file (docs/hands.md) into a `HandModel`.
 
-The mapping (TOML, docs/hands.md) names the wrist and fingers of the model. Fixed joints between
-hinges are merged into the frame of the next hinge or into the tip, so that hinge angles are those
-of the model. Common mistakes of mappings are detected in the resulting hand: millimetres instead of
-metres, the thumb on the wrong side, fingers that bend backwards.
+Fixed joints are merged into the next hinge's frame or the tip. The resulting hand shows common
+mistakes: millimetres, the thumb on the wrong side, fingers that bend backwards.
 """
 
 import tomllib
@@ -15,8 +13,9 @@ import numpy as np
 from jaxtyping import Float64
 from pydantic import BeforeValidator, Field, ValidationError, model_validator
 
+from dextouch.data_folder import read_bounded
 from dextouch.errors import InvalidInputError, UnknownNameError
-from dextouch.frozen_model import FrozenModel
+from dextouch.frozen_model import FrozenModel, first_problem
 from dextouch.geometry import apply, invert, transform
 from dextouch.geometry.rotations import quaternion_from_rotation, rotation_from_vector
 from dextouch.hands.hand_files.models import (
@@ -25,7 +24,6 @@ from dextouch.hands.hand_files.models import (
     Joint,
     MjcfModel,
     UrdfModel,
-    read_bounded,
     read_elements,
     vector3,
 )
@@ -142,14 +140,7 @@ def read_mapping(path: Path) -> HandMapping:
     except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise InvalidInputError(f"{path.name}: got invalid TOML: {error}") from error
     except ValidationError as error:
-        problem = error.errors(include_url=False)[0]
-        where = ".".join(str(part) for part in problem["loc"])
-        message = problem["msg"].removeprefix("Value error, ")
-        if problem["type"] == "missing":
-            message = "got none, expected one"
-        elif problem["type"] != "value_error":
-            message = f"got {problem['input']!r:.80}: {message}"
-        raise InvalidInputError(f"{path.name} {where}: {message}") from error
+        raise InvalidInputError(f"{path.name} {first_problem(error)}") from error
 
 
 def load_hand(model_path: Path | str, mapping_path: Path | str) -> HandModel:
@@ -263,7 +254,6 @@ def _finger_table(
 def _links_between(
     model: ModelFile, bases: dict[str, np.ndarray], tip: str, where: str
 ) -> tuple[str, list[str]]:
-    """The base link of a tip, and the links from there to the tip."""
     links: list[str] = []
     link = tip
     while link not in bases:

@@ -1,10 +1,8 @@
 """Links and joints of hand models in URDF and MJCF, read from XML with source locations.
 
-The reader is built on expat: a document type declaration, and with it every entity, is refused;
-depth and number of elements are limited. Of URDF (https://wiki.ros.org/urdf/XML) defaults follow
-the format: origin zero, axis x, lower and upper limit zero. Of MJCF
-(https://mujoco.readthedocs.io/en/stable/XMLreference.html) a body may have several joints, each
-with its own anchor; `frame` elements transform their children.
+Document type declarations, and with them every entity, are refused; depth and number of elements
+are limited. Defaults follow https://wiki.ros.org/urdf/XML and
+https://mujoco.readthedocs.io/en/stable/XMLreference.html.
 """
 
 import re
@@ -17,12 +15,11 @@ from xml.parsers import expat
 
 import numpy as np
 
+from dextouch.data_folder import read_bounded
 from dextouch.errors import (
     DegenerateRotationError,
     InvalidInputError,
     LimitExceededError,
-    NotFoundError,
-    StorageError,
     UnknownNameError,
 )
 from dextouch.geometry import apply, transform
@@ -132,7 +129,8 @@ def read_elements(path: Path) -> Element:
     parser.EndElementHandler = lambda _: ancestors.pop()
     parser.StartDoctypeDeclHandler = doctype
     try:
-        parser.Parse(read_bounded(path, MAX_BYTES), True)  # noqa: FBT003 - takes no keywords
+        data = read_bounded(path, MAX_BYTES, hint="; meshes belong into files of their own")
+        parser.Parse(data, True)  # noqa: FBT003 - takes no keywords
     except expat.ExpatError as error:
         raise InvalidInputError(
             f"{path.name} line {error.lineno}: got invalid XML "
@@ -141,25 +139,6 @@ def read_elements(path: Path) -> Element:
     except (ValueError, LookupError) as error:
         raise InvalidInputError(f"{path.name}: got an unknown text encoding: {error}") from error
     return document.children[0]
-
-
-def read_bounded(path: Path, max_bytes: int) -> bytes:
-    """Read a regular file of limited size."""
-    try:
-        if not path.exists():
-            raise NotFoundError(f"{path}: no such file")
-        if not path.is_file():
-            raise InvalidInputError(f"{path}: got a folder or device, expected a regular file")
-        with path.open("rb") as file:
-            data = file.read(max_bytes + 1)
-    except OSError as error:
-        raise StorageError(f"{path}: cannot be read: {error.strerror}") from error
-    if len(data) > max_bytes:
-        raise LimitExceededError(
-            f"{path}: got more than {max_bytes} bytes, expected a hand's description of at most "
-            "that; meshes belong into files of their own"
-        )
-    return data
 
 
 def vector3(values: np.ndarray) -> Vector3:
@@ -206,10 +185,7 @@ class Link(NamedTuple):
 
 
 class UrdfModel:
-    """The links of a URDF, which must be a tree without unprocessed xacro.
-
-    Links are read when asked for, so that only those of fingers must be valid.
-    """
+    """The links of a URDF, a tree without unprocessed xacro, which are read when asked for."""
 
     def __init__(self, root: Element) -> None:
         self.source = root.source.rpartition(" line ")[0]

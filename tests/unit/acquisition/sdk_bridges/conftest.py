@@ -14,7 +14,7 @@ from dextouch.streams import unpack
 from services.acquisition.app import create_app
 from services.acquisition.clock import StationClock
 from services.acquisition.devices import build_drivers
-from services.acquisition.sdk_bridges import server
+from services.acquisition.sdk_bridges import bridge as bridge_module
 from services.acquisition.settings import AcquisitionSettings
 
 HERE = Path(__file__).parent
@@ -33,7 +33,7 @@ class RunningBridge:
 
     def _run(self, address):
         try:
-            self._summary = server.run_bridge(
+            self._summary = bridge_module.run_bridge(
                 self.source, address, stop=self._stop, say=self.said.append
             )
         except Exception as error:  # noqa: BLE001 - shown by the test's thread
@@ -75,7 +75,7 @@ def _long_silence(monkeypatch):
 @pytest.fixture
 def serve(monkeypatch):
     """Serves sources until the test ends."""
-    monkeypatch.setattr(server, "RETRY_S", 0.02)
+    monkeypatch.setattr(bridge_module, "RETRY_S", 0.02)
     bridges = []
 
     def serve(source, *address):

@@ -17,21 +17,19 @@ from dextouch.errors import DeviceError, InvalidInputError, UnavailableError
 from services.acquisition.app import create_app
 from services.acquisition.clock import StationClock
 from services.acquisition.drivers.sdk_link import BridgedDevice, parse_hello
-from services.acquisition.sdk_bridges import server as server_module
-from services.acquisition.sdk_bridges.server import (
+from services.acquisition.sdk_bridges import bridge as bridge_module
+from services.acquisition.sdk_bridges.bridge import (
     MAX_STATIONS,
+    OUR_AXES,
     QUEUE_PACKETS,
     BridgeServer,
-    Summary,
-    run_bridge,
-)
-from services.acquisition.sdk_bridges.source import (
-    OUR_AXES,
     Pace,
     Reading,
     Source,
+    Summary,
     hello,
     pose_reading,
+    run_bridge,
     station_offset_ns,
 )
 from services.acquisition.settings import AcquisitionSettings
@@ -151,9 +149,9 @@ def test_one_failed_accept_does_not_end_listening(monkeypatch, connect):
 
 def test_a_link_that_cannot_be_set_up_is_closed(monkeypatch, listening, connect):
     failures = [OSError(errno.EINVAL, "the station has gone")]
-    made = server_module.StationLink
+    made = bridge_module.StationLink
     monkeypatch.setattr(
-        server_module,
+        bridge_module,
         "StationLink",
         lambda *about: made(*about) if not failures else fail(failures),
     )
@@ -344,7 +342,7 @@ def test_the_pace_leaves_out_what_has_passed(monkeypatch):
             return self.t_ns
 
     clock, slept_s = Clock(), []
-    monkeypatch.setattr("services.acquisition.sdk_bridges.source.time.sleep", slept_s.append)
+    monkeypatch.setattr("services.acquisition.sdk_bridges.bridge.time.sleep", slept_s.append)
     pace = Pace(100.0, clock)
     for clock.t_ns in (0, 12_000_000, 47_000_000):
         pace.wait()

@@ -8,14 +8,12 @@ import sys
 import pytest
 
 from dextouch.errors import InvalidInputError
-from services.acquisition.sdk_bridges.command_line import build_source, main
-from services.acquisition.sdk_bridges.libsurvive_trackers import LibsurviveTrackers
+from services.acquisition.sdk_bridges.bridge import OUR_AXES, hello
+from services.acquisition.sdk_bridges.command_line import PORTS, bridge_parser, build_source, main
+from services.acquisition.sdk_bridges.lighthouse_trackers import LibsurviveTrackers, OpenVrTrackers
 from services.acquisition.sdk_bridges.lsl_stream import LslStream
 from services.acquisition.sdk_bridges.manus_gloves import ManusGloves
-from services.acquisition.sdk_bridges.openvr_trackers import OpenVrTrackers
 from services.acquisition.sdk_bridges.openxr_hands import OpenXrHands
-from services.acquisition.sdk_bridges.parser import PORTS, bridge_parser
-from services.acquisition.sdk_bridges.source import OUR_AXES, hello
 
 
 def source_of(line):

@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from dextouch.errors import DeviceError, UnavailableError
-from services.acquisition.sdk_bridges.libsurvive_trackers import LibsurviveTrackers
+from services.acquisition.sdk_bridges.lighthouse_trackers import LibsurviveTrackers
 
 TRACKER, BASE, WAND = range(3)
 SERIAL = "LHR-1A2B3C4D"
@@ -124,7 +124,7 @@ def test_libsurvive_that_ends_is_started_again(survive, serve, connect, read):
 
 
 def test_arguments_are_passed_and_a_refusal_is_another_try(survive, monkeypatch):
-    module = "services.acquisition.sdk_bridges.libsurvive_trackers"
+    module = "services.acquisition.sdk_bridges.lighthouse_trackers"
     monkeypatch.setattr(f"{module}.LIST_S", 0.0)
     source = LibsurviveTrackers({}, library=survive.path, arguments=("--simulator",))
     assert source.present() == [

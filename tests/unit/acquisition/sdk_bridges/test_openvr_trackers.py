@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from dextouch.errors import DeviceError, UnavailableError
 from services.acquisition.clock import StationClock
-from services.acquisition.sdk_bridges.openvr_trackers import OpenVrTrackers
+from services.acquisition.sdk_bridges.lighthouse_trackers import OpenVrTrackers
 
 SERIALS = {2: "LHR-LEFT", 5: "LHR-HEAD", 7: "LHB-BASE"}
 RUNNING_OK, OUT_OF_RANGE = 200, 201

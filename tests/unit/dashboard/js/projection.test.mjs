@@ -5,10 +5,8 @@ import { readFileSync } from "node:fs";
 import { test } from "node:test";
 
 const { STATIC, CASES } = process.env;
-const { fitted, orbitCamera, project, turned, zoomed } = await import(`${STATIC}/projection.js`);
-const { readPoses, scene } = await import(`${STATIC}/poses.js`);
-const { PADS, padForces, statesOf, taxelName, trusted } = await import(`${STATIC}/taxels.js`);
-const { withLayout } = await import(`${STATIC}/layouts.js`);
+const { fitted, orbitCamera, project, readPoses, scene, turned, zoomed } = await import(`${STATIC}/poses.js`);
+const { PADS, padForces, statesOf, taxelName, trusted, withLayout } = await import(`${STATIC}/taxels.js`);
 const { cameras, message, sides, pressures, forces, names, heatmap, layout, canvases, own_layout, own_canvases } = JSON.parse(readFileSync(CASES, "utf8"));
 
 const near = (got, expected, tolerance) => got.forEach((value, index) => assert.ok(Math.abs(value - expected[index]) < tolerance, `got ${got}, expected ${expected}`));
@@ -53,6 +51,28 @@ test("after a fit every point is in the picture", () => {
       const { x_px, y_px } = project(T, point, size);
       assert.ok(x_px >= 0 && x_px <= size.width_px && y_px >= 0 && y_px <= size.height_px);
     }
+  }
+});
+
+test("a flat picture follows points that leave it, until somebody chose a view", async () => {
+  Object.assign(globalThis, { ResizeObserver: class { observe() {} }, requestAnimationFrame() {} });
+  const { OrbitCanvas } = await import(`${STATIC}/canvas.js`);
+  for (const size of [{ width_px: 500, height_px: 120 }, { width_px: 120, height_px: 400 }]) {
+    const view = new OrbitCanvas({ addEventListener() {} }, { paint() {} });
+    const isInside = (point) => {
+      const { x_px, y_px } = project(orbitCamera(view.orbit), point, size);
+      return x_px >= 0 && x_px <= size.width_px && y_px >= 0 && y_px <= size.height_px;
+    };
+    view.size = size;
+    view.fit([[0, 0, 1], [0.1, 0, 1.1]]);
+    const near_m = view.orbit.distance_m;
+    const fingers = [[-0.5, 0.2, 0.7], [0.5, -0.2, 1.6]];
+    view.fit(fingers);
+    assert.ok(fingers.every(isInside) && view.orbit.distance_m > near_m);
+    view.move(zoomed(view.orbit, 0.5));
+    const chosen = view.orbit;
+    view.fit([[-0.5, 0.2, 0.7], [0.5, -0.2, 1.6]]);
+    assert.equal(view.orbit, chosen);
   }
 });
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dextouch.geometry import transform
-from services.world_model.rendering.configuration import RendererConfig
+from services.world_model.network.configuration import RendererConfig
 from services.world_model.rendering.inputs import Scenes
 from services.world_model.rendering.training import SceneClip
 from tests.unit.world_model.rendering.scene_by_hand import (

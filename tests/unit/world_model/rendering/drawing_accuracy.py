@@ -17,8 +17,8 @@ from dextouch.errors import InvalidInputError
 from dextouch.metrics.image import PEAK, decibels
 from dextouch.schemas import CHUNK_STEPS
 from services.world_model.rendering.inputs import PreparedScenes, Scenes, drawing_inputs
-from services.world_model.rendering.network import RendererNetwork
 from services.world_model.rendering.rasters import SceneStates
+from services.world_model.rendering.renderer import RendererNetwork
 from services.world_model.rendering.training import SceneClip, gather
 
 _REACH_PX = 5

@@ -8,7 +8,7 @@ import torch
 
 from dextouch.geometry import transform
 from dextouch.geometry.rotations import rotation_from_vector
-from services.world_model.rendering.configuration import RendererConfig
+from services.world_model.network.configuration import RendererConfig
 from services.world_model.rendering.inputs import (
     CameraMotion,
     PreparedScenes,
@@ -16,8 +16,7 @@ from services.world_model.rendering.inputs import (
     drawing_inputs,
     sample_images,
 )
-from services.world_model.rendering.network import RendererNetwork
-from services.world_model.rendering.renderer import Renderer
+from services.world_model.rendering.renderer import Renderer, RendererNetwork
 from tests.unit.world_model.rendering.scene_by_hand import (
     BOXES_M,
     DOWN,

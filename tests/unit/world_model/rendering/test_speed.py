@@ -8,11 +8,10 @@ import torch
 from torch.nn import functional
 
 from services.world_model.checkpoints import read_state_checkpoint
-from services.world_model.rendering.configuration import RendererConfig
+from services.world_model.network.configuration import RendererConfig
 from services.world_model.rendering.inputs import PreparedScenes
-from services.world_model.rendering.network import RendererNetwork
-from services.world_model.rendering.renderer import Renderer
-from services.world_model.shipped_checkpoints import PRETRAINED
+from services.world_model.rendering.renderer import Renderer, RendererNetwork
+from services.world_model.settings import PRETRAINED
 from tests.unit.world_model.rendering.scene_by_hand import (
     BOXES_M,
     K,
@@ -178,4 +177,4 @@ def test_starts_of_several_rollouts_are_remembered_up_to_a_limit(small, image, s
     # The start that was not used for longest has been dropped.
     draw_level(1)
     assert len(prepared) == 66
-    assert len(renderer._starts) == 64
+    assert len(renderer._starts._values) == 64

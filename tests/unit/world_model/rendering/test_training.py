@@ -8,14 +8,14 @@ import torch
 
 from benchmarks.evaluator.playing import sharpness
 from dextouch.errors import InvalidInputError
-from services.world_model.rendering.configuration import RendererTraining
-from services.world_model.rendering.network import RendererNetwork
+from services.world_model.rendering.renderer import RendererNetwork
 from services.world_model.rendering.training import (
     RendererRun,
     drawing_loss,
     gather,
     train_renderer,
 )
+from services.world_model.settings import RendererTraining
 from tests.unit.world_model.rendering.drawing_accuracy import evaluate_drawing
 
 

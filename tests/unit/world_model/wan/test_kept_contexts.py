@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from services.world_model.network.inputs import build_inputs
-from services.world_model.network.kept import LastUsed
+from services.world_model.network.instruction import LastUsed
 from services.world_model.network.model import JointWorldModel, Sampling
 from services.world_model.pretrained_video import load_pretrained
 from services.world_model.training.dataset import WindowPosition

@@ -16,7 +16,7 @@ from dextouch.errors import (
 from services.networks.weight_files import memory_of
 from services.world_model import pretrained_video
 from services.world_model.network.codecs import empty_autoencoder
-from services.world_model.network.configuration import WanConfig
+from services.world_model.network.configuration import NetworkConfig, WanConfig
 from services.world_model.network.video import empty_transformer
 from services.world_model.pretrained_video import load_weights
 
@@ -28,7 +28,7 @@ TINY = {"num_layers": 2, "num_heads": 2, "head_width": 12}
 
 @pytest.fixture
 def empty(wan_config):
-    return empty_transformer(wan_config, **TINY)
+    return empty_transformer(NetworkConfig(**TINY), wan_config)
 
 
 def _store(folder, network):
@@ -60,7 +60,9 @@ def test_shards_written_by_diffusers_load(tmp_path, transformer, empty):
 def test_weights_take_the_precision_of_the_network_but_norms_and_times_stay_float32(
     tmp_path, transformer, wan_config
 ):
-    empty = empty_transformer(wan_config.model_copy(update={"precision": "bfloat16"}), **TINY)
+    empty = empty_transformer(
+        NetworkConfig(**TINY), wan_config.model_copy(update={"precision": "bfloat16"})
+    )
     _load(empty, _store(tmp_path, transformer))
     # Checked in the published checkpoint as loaded by diffusers with torch_dtype=bfloat16.
     kept = {name for name, tensor in empty.state_dict().items() if tensor.dtype == torch.float32}
@@ -76,8 +78,10 @@ def test_weights_take_the_precision_of_the_network_but_norms_and_times_stay_floa
 
 def test_what_does_not_belong_to_the_network_is_named(tmp_path, transformer, wan_config):
     _store(tmp_path, transformer)
-    deeper = empty_transformer(wan_config, **TINY | {"num_layers": 3})
-    wider = empty_transformer(wan_config.model_copy(update={"ffn_width": 48}), **TINY)
+    deeper = empty_transformer(NetworkConfig(**TINY | {"num_layers": 3}), wan_config)
+    wider = empty_transformer(
+        NetworkConfig(**TINY), wan_config.model_copy(update={"ffn_width": 48})
+    )
     with pytest.raises(InvalidInputError, match=r"27 tensors missing \['blocks\.2"):
         _load(deeper, tmp_path)
     with pytest.raises(InvalidInputError, match=r"ffn\.net\.\S+ has shape \(.*expected \("):
@@ -105,7 +109,8 @@ def test_weights_that_do_not_fit_are_refused_before_they_are_read(
 
 
 def test_the_full_size_needs_ten_gigabytes():
-    network = empty_transformer(WanConfig(), num_layers=30, num_heads=24, head_width=128)
+    sizes = NetworkConfig(num_layers=30, num_heads=24, head_width=128)
+    network = empty_transformer(sizes, WanConfig())
     # Two bytes each, and two more for time embedding (256 + 3072 + 2) x 3072, thirty affine norms
     # 2 x 3072, thirty tables 6 x 3072 and the last 2 x 3072.
     kept = (256 + 3072 + 2 + 30 * 2 + 30 * 6 + 2) * 3072
@@ -113,7 +118,8 @@ def test_the_full_size_needs_ten_gigabytes():
 
 
 def test_the_published_size_has_its_tensors_and_weights():
-    network = empty_transformer(WanConfig(), num_layers=30, num_heads=24, head_width=128)
+    sizes = NetworkConfig(num_layers=30, num_heads=24, head_width=128)
+    network = empty_transformer(sizes, WanConfig())
     tensors = network.state_dict()
     assert len(tensors) == 825
     assert sum(tensor.numel() for tensor in tensors.values()) == 4_999_787_712

@@ -11,8 +11,8 @@ from torch.testing._internal.distributed.fake_pg import FakeStore
 from dextouch.errors import ConflictError, CorruptDataError, InvalidInputError
 from services.networks.weight_files import memory_of, read_tensors, write_tensors
 from services.world_model.checkpoints import read_checkpoint
-from services.world_model.network.low_rank import AdaptedLinear, is_adapter
 from services.world_model.network.model import JointWorldModel
+from services.world_model.network.video import AdaptedLinear, is_adapter
 from services.world_model.paper_settings import LoraSettings, TrainCommand
 from services.world_model.pretrained_video import freeze_pretrained, is_pretrained
 from services.world_model.training.distribution import Processes, joined_processes
