@@ -90,13 +90,13 @@ def run_train_judge(arguments: list[str]) -> int:
             ),
             [*read(settings.episodes), *read(settings.development)],
             settings.training,
-            command=command_line("probe", arguments),
+            command=command_line("judge", arguments),
         )
         return keep(calibrated, settings.output, settings.json_path)
     checkpoint = train_success_classifier(
         read(settings.episodes),
         settings.training,
-        command=command_line("probe", arguments),
+        command=command_line("judge", arguments),
         development=read(settings.development),
         held_out=read(settings.held_out),
         jobs=settings.jobs,

@@ -100,6 +100,7 @@ def test_the_probe_can_be_trained_from_the_command_line(url, tmp_path, capsys):
     probe = SuccessClassifier.load(output)
     assert probe.metadata.settings["instructions"] == toy.INSTRUCTIONS
     assert json.loads(figures.read_text())["metrics"] == probe.metadata.metrics
+    assert probe.metadata.command.startswith("dextouch train judge --episodes ")
 
 
 @pytest.mark.long
