@@ -18,8 +18,8 @@ from services.evaluation.agreement import (
     pooled_agreement,
     task_agreement,
 )
+from services.evaluation.rendering import UNDEFINED, rendered
 from services.evaluation.statistics import MatchedScores, known_mean, wilson_interval
-from services.evaluation.templates import UNDEFINED, rendered
 
 # Endings that should be decided where classifier and world are good enough.
 LEAST_DECIDED: Final = 0.60

@@ -14,7 +14,7 @@ from dextouch.serving import configure_logging
 from services.evaluation.bundled_policies import bundled_policy, trained_policy, training_starts_of
 from services.evaluation.matched_starts import WorldAddress
 from services.evaluation.perceptual_networks import Metric
-from services.evaluation.policies.outside import load_policies
+from services.evaluation.policies.user_policies import load_policies
 from services.evaluation.prediction import (
     ALL_TASKS,
     GEOMETRY,

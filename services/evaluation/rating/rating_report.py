@@ -23,13 +23,13 @@ from services.evaluation.rating.marks import (
     rubric_of,
     vote,
 )
+from services.evaluation.rendering import UNDEFINED
 from services.evaluation.statistics import (
     Interval,
     bootstrap_mean_interval,
     central_interval,
     start_counts,
 )
-from services.evaluation.templates import UNDEFINED
 
 Level = Literal["nominal", "interval"]
 LEAST_ALPHA: Final = 0.667

@@ -15,6 +15,7 @@ from typing import Any
 
 from dextouch import __version__
 from dextouch.free_text import printable
+from services.evaluation.rendering import environment
 from services.evaluation.reporting.pictures import (
     FULL_SCALE_KPA,
     MAX_MOVING,
@@ -36,7 +37,6 @@ from services.evaluation.reporting.sections import (
     tiles,
     undecided_note,
 )
-from services.evaluation.templates import environment
 
 
 def write_report(report: Mapping[str, Any], pictures: ReportPictures, path: Path) -> None:

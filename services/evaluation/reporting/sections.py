@@ -5,8 +5,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
+from services.evaluation.rendering import UNDEFINED, escape_latex, figure, is_number, rendered
 from services.evaluation.scores import REAL, ClosedLoopReport
-from services.evaluation.templates import UNDEFINED, escape_latex, figure, is_number, rendered
 
 # Key of the figure, its name on the page, its unit, and its bound, if any.
 ERRORS: tuple[tuple[str, str, str, tuple[str, float] | None], ...] = (

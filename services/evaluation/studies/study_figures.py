@@ -17,6 +17,7 @@ from dextouch.episodes import EpisodeStore
 from dextouch.errors import DexTouchError, UnknownNameError
 from dextouch.frozen_model import FrozenModel
 from services.evaluation.closed_loop import example_pairs, title_of
+from services.evaluation.rendering import UNDEFINED
 from services.evaluation.reporting import write_report
 from services.evaluation.reporting.pictures import (
     MAX_MOVING,
@@ -45,7 +46,6 @@ from services.evaluation.studies.results import (
     rollout_episode_id,
     study_report,
 )
-from services.evaluation.templates import UNDEFINED
 
 logger = structlog.get_logger(__name__)
 

@@ -10,7 +10,7 @@ from services.evaluation.recorded_takes import REPLAY
 from services.pipelines import evaluate
 from services.pipelines.parsers import recorded_parser
 
-HOLD = "services.evaluation.policies.replay:HoldPolicy"
+HOLD = "services.evaluation.policies.open_loop:HoldPolicy"
 
 
 def policies(*words):

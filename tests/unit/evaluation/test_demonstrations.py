@@ -14,7 +14,7 @@ from services.evaluation.endings import read_ending_episodes
 from services.evaluation.matched_starts import refuse_training_starts, start_digest
 from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
 from services.evaluation.policies.cloning_training import read_cloning_episodes
-from services.evaluation.policies.replay import ReplayPolicy
+from services.evaluation.policies.open_loop import ReplayPolicy
 from services.evaluation.reporting.pictures import action_picture, episode_picture
 from services.evaluation.success_classifier import SuccessClassifier
 from tests.unit.evaluation import toy

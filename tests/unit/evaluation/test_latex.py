@@ -1,8 +1,8 @@
 """LaTeX tables, against a table written by hand."""
 
+from services.evaluation.rendering import escape_latex
 from services.evaluation.reporting.sections import latex_tables
 from services.evaluation.scores import ClosedLoopReport, RolloutScore
-from services.evaluation.templates import escape_latex
 
 # Three policies, four starts, two imagined worlds: rates 1, 0, .5 | .75, .25, .5 | .5, .5, .5.
 MARKS = {
