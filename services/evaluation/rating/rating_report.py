@@ -13,16 +13,8 @@ from typing import Any, Final, Literal
 import numpy as np
 from jaxtyping import Float64
 
-from services.evaluation.rating.marks import (
-    FIRST,
-    REPEAT,
-    Mark,
-    Rubric,
-    StoredMark,
-    by_people,
-    rubric_of,
-    vote,
-)
+from services.evaluation.rating.marks import FIRST, REPEAT, Mark, StoredMark, by_people, vote
+from services.evaluation.rating.rubrics import Rubric, rubric_of
 from services.evaluation.rendering import UNDEFINED
 from services.evaluation.statistics import (
     Interval,
