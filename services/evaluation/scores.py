@@ -218,7 +218,10 @@ class ClosedLoopReport:
             known = np.isfinite(means["real"]) & np.isfinite(means["imagined"])
             if num_policies := int(known.sum()):
                 pair = {side: values[known] for side, values in means.items()}
-                figures = {n: defined(FIGURES[n](**pair), num_policies) for n in _RUBRIC_FIGURES}
+                figures = {
+                    name: defined(FIGURES[name].compute(**pair), num_policies)
+                    for name in _RUBRIC_FIGURES
+                }
                 found[task] = {**figures, "num_policies": num_policies}
         return found
 
@@ -254,7 +257,9 @@ class ClosedLoopReport:
             counts = {"num_policies": 0, "num_starts": 0, "rates": {}, "not_comparable": vague}
             return undefined | counts, None
         pair = {"real": real.mean(axis=1), "imagined": known_mean(imagined, axis=1)}
-        found: dict[str, Any] = {n: defined(f(**pair), len(real)) for n, f in FIGURES.items()}
+        found: dict[str, Any] = {
+            name: defined(one.compute(**pair), len(real)) for name, one in FIGURES.items()
+        }
         joined = None
         if min(real.shape) >= 2:
             generator = np.random.default_rng(_SEED)
