@@ -33,7 +33,7 @@ class Measure(NamedTuple):
     compute: Callable[..., float]
 
 
-# All figures of agreement, by their keys in report.json; reports, tables and pages derive from it.
+# By their keys in report.json; reports and tables derive from this list.
 FIGURES: Final[Mapping[str, Measure]] = {
     "pearson": Measure("Pearson", policy.pearson),
     "spearman": Measure("Spearman", policy.spearman),

@@ -71,7 +71,6 @@ function figureCell(one, name, caution = "") {
 
 // Figures of agreement that have a column: their keys in a study's figures, and their titles.
 export const FIGURES = [["pearson", "Pearson"], ["kendall", "Kendall"], ["mean_absolute_error", "Mean absolute error"], ["mmrv", "MMRV"], ["bias", "Bias"]];
-
 export function agreementRow(one) {
   const comments = one.comments.length ? element("details", {}, element("summary", {}, "What this shows"),
     element("ul", {}, ...one.comments.map((text) => element("li", {}, text)))) : null;

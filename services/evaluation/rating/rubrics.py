@@ -13,7 +13,6 @@ from dextouch.frozen_model import FrozenModel
 from dextouch.schemas import first_problems
 
 BUNDLED: Final = Path(__file__).with_name("rubrics.toml")
-_NAME: Final = r"^[a-z][a-z0-9_]{0,63}$"
 
 
 class Criterion(FrozenModel):
@@ -24,7 +23,7 @@ class Criterion(FrozenModel):
     milestone of the twin.
     """
 
-    name: str = Field(pattern=_NAME)
+    name: str = Field(pattern=r"^[a-z][a-z0-9_]{0,63}$")
     points: float = Field(gt=0, le=100, allow_inf_nan=False)
     description: FreeText = Field(min_length=1, max_length=500)
     requires: tuple[str, ...] = ()

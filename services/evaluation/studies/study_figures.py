@@ -81,9 +81,9 @@ class StudySummary(FrozenModel):
 class StudyRate(FrozenModel):
     """Success rate of a policy in a task of a world, with its 95 % Wilson interval.
 
-    It is None without decided rollouts: the success classifier abstains on `num_unreliable`, for
-    `reasons`, which count in no rate; `is_comparable` if it decided enough. `num_missing` have no
-    result yet, and `num_disagreements` starts have another outcome than in the real world.
+    It is None without decided rollouts: the success classifier leaves `num_unreliable` undecided,
+    for `reasons`; they count in no rate; `is_comparable` if it decided enough. `num_missing` have
+    no result yet, and `num_disagreements` starts have another outcome than in the real world.
     """
 
     world: str
