@@ -230,8 +230,8 @@ def recorded_parser() -> argparse.ArgumentParser:
     add("--policy-arguments", type=_keywords_by_name, default={}, metavar="JSON", help=keywords)
     cloned = "a policy of `dextouch train policy`, NAME=CHECKPOINT; repeat for more"
     add("--cloned", action="append", type=_named_path, default=[], metavar="POLICY", help=cloned)
-    add("--builtin", action="append", choices=BUNDLED, default=[], help="repeatable")
-    add("--hold", action="append_const", dest="builtin", const="hold", help="hold still, too")
+    add("--builtin", action="append", choices=BUNDLED, default=[], help="built-in; repeatable")
+    add("--hold", action="append_const", dest="builtin", const="hold", help="--builtin hold")
     add_json(parser)
     return parser
 
