@@ -35,7 +35,7 @@ from dextouch.episodes import (
 from dextouch.errors import InvalidInputError
 from dextouch.schemas import MAX_OBJECTS, RolloutStart
 from dextouch.streams import HEAD_CAMERA
-from services.evaluation.calibration import (
+from services.evaluation.classifier_calibration import (
     MIN_OUTCOMES,
     expected_calibration_error,
     fit_calibration,

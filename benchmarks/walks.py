@@ -37,8 +37,8 @@ from services.acquisition.settings import MockLinks
 from services.acquisition.uploader import Uploader
 from services.episode_store.app import create_app
 from services.episode_store.settings import EpisodeStoreSettings
-from services.evaluation.policies.outside import action_chunk, ask
-from services.evaluation.policies.replay import HoldPolicy
+from services.evaluation.policies.open_loop import HoldPolicy
+from services.evaluation.policies.user_policies import action_chunk, ask
 from services.pipelines.servers import served
 
 TAKE_S = 2.0

@@ -15,6 +15,7 @@ from dextouch.command_line import RAY_HELP, CommandParser, add_json, add_workers
 from dextouch.data_folder import default_store
 from dextouch.episodes import SPLITS
 from dextouch.errors import InvalidInputError
+from services.evaluation.bundled_policies import BUNDLED
 from services.evaluation.prediction_names import BASELINES, DEFAULT_BASELINES, METRIC_NAMES
 from services.twin.names import (
     DEFAULT_MIX,
@@ -229,7 +230,8 @@ def recorded_parser() -> argparse.ArgumentParser:
     add("--policy-arguments", type=_keywords_by_name, default={}, metavar="JSON", help=keywords)
     cloned = "a policy of `dextouch train policy`, NAME=CHECKPOINT; repeat for more"
     add("--cloned", action="append", type=_named_path, default=[], metavar="POLICY", help=cloned)
-    add("--hold", action="store_true", help="also score a policy that holds still")
+    add("--builtin", action="append", choices=BUNDLED, default=[], help="built-in; repeatable")
+    add("--hold", action="append_const", dest="builtin", const="hold", help="--builtin hold")
     add_json(parser)
     return parser
 
