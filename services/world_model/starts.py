@@ -23,7 +23,7 @@ from dextouch.images import scaled_square
 from dextouch.schemas import EVERYTHING, Observation, ReturnSelector, RolloutStart, WorldDescription
 from dextouch.streams import HEAD_CAMERA, unpack
 from dextouch.tactile.layout import DEXTOUCH_V1, TactileLayout
-from dextouch.worlds import BatchWorld, SteppedRollout
+from dextouch.worlds import BatchWorld, SteppedRollout, check_chunk
 from services.world_model.checkpoints import StateCheckpoint
 from services.world_model.dynamics.features import (
     BOX_AXES,
@@ -184,7 +184,8 @@ class PredictedWorld(BatchWorld[State]):
         """Predict action chunks of 4k steps; others of the batch change results by rounding.
 
         Raises:
-            ShapeError: a chunk of another length, or not one and a seed for each rollout.
+            ShapeError: not a chunk of 4k steps and a seed for each rollout.
+            LimitExceededError: chunks of more than `max_chunk_steps`.
             InvalidInputError: physically impossible actions, or views without a start.
             EndedError: hands have moved four times as long as any episode of training.
             UnavailableError: the model predicts NaN or infinity.
@@ -204,13 +205,7 @@ class PredictedWorld(BatchWorld[State]):
                 "was trained on"
             )
             raise EndedError(f"world {world.name}: {reason}", reason=reason)
-        chunks = [check_actions(chunk, where="action chunk") for chunk in actions]
-        multiple, longest, length = world.chunk_multiple, world.max_chunk_steps, len(chunks[0])
-        if length % multiple or length > longest:
-            raise ShapeError(
-                f"action chunk: got {length} rows, expected a multiple of {multiple} up to "
-                f"{longest}"
-            )
+        chunks = [check_actions(check_chunk(chunk, world), where="chunk") for chunk in actions]
         return self._stepped(states, chunks, seeds, requested)
 
 

@@ -35,7 +35,6 @@ from services.world_model.rendering.rasters import SceneStates
 from services.world_model.rendering.renderer import Drawing, Renderer
 
 MAX_SNAPSHOT_BYTES = 2**20
-MAX_CHUNK_STEPS = 64
 # Pose reported for objects believed absent: below the table, where no task places one.
 ABSENT_POSE = np.array([0.0, 0.0, -1.0, 1.0, 0.0, 0.0, 0.0], dtype=np.float32)
 # A rollout is flagged once its hands have moved 1.5 times the length of a training episode.
@@ -91,7 +90,6 @@ class StateWorld(starts.PredictedWorld[StateRollout]):
             action_kinds=ACTION_KINDS,
             starts_from=("observation",),
             chunk_multiple=features.STEPS_PER_LATENT,
-            max_chunk_steps=MAX_CHUNK_STEPS,
             object_names=self._metadata.object_names,
             scales_images=True,
             tactile_layout=config.layout,

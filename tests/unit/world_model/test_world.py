@@ -9,6 +9,7 @@ import torch
 from dextouch.errors import (
     DexTouchError,
     InvalidInputError,
+    LimitExceededError,
     NonFiniteError,
     ShapeError,
     UnavailableError,
@@ -233,9 +234,11 @@ def test_chunks_it_cannot_follow_are_refused(world, toy_episode):
     episode = toy_episode(0)
     state = world.reset(make_start(episode)).state
     rows = episode.actions["commanded"]
-    for length in (1, 3, 18, 20):
+    for length in (1, 3, 18):
         with pytest.raises(ShapeError):
             world.step(state, rows[1 : 1 + length], seed=0)
+    with pytest.raises(LimitExceededError, match="got 20 steps, expected at most 16"):
+        world.step(state, rows[1:21], seed=0)
     broken = rows[1:5].copy()
     broken[2, 30] = np.nan
     with pytest.raises(NonFiniteError):
