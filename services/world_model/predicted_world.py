@@ -32,7 +32,7 @@ from services.world_model.dynamics.features import (
     poses_from_objects,
 )
 from services.world_model.dynamics.model import first_steps, mean_poses
-from services.world_model.dynamics.trees import stacked
+from services.world_model.dynamics.tensor_trees import stacked
 from services.world_model.network.inputs import ObjectsAtStart, PredictionRequest
 
 # Larger values are mistakes of units or frames.
