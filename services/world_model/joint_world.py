@@ -38,7 +38,6 @@ from services.world_model.network.inputs import (
 )
 from services.world_model.network.model import Sampling, stack_noise
 
-MAX_SNAPSHOT_BYTES = 4 * 2**20
 _IMAGE = "image/"
 _SNAPSHOT_ARRAYS = ("image", "tactile_kpa", "reached", "anchor", "K_head", "still_m")
 _SNAPSHOT_FIELDS = ("instruction", "action_kind", "step", "task", "num_still", "num_moving")
@@ -110,10 +109,9 @@ class JointWorldState(predicted_world.ObservedStart):
 class JointWorld(predicted_world.PredictedWorld[JointWorldState]):
     """A flow-matching model as a world.
 
-    With contact geometry, `reader` finds
-    objects at a chunk's start. A scene is at rest, bit for bit and without the network, in chunks
-    without motion that follow two seconds without motion, or a start at which the hands touch
-    nothing.
+    With contact geometry, `reader` finds objects at a chunk's start. A scene is at rest, bit for bit
+    and without the network, in chunks without motion that follow two seconds without motion, or a
+    start at which the hands touch nothing.
 
     Raises:
         InvalidInputError: a model with contact geometry, and no reader of all its tasks and of the
@@ -301,7 +299,7 @@ class JointWorld(predicted_world.PredictedWorld[JointWorldState]):
     def restore(self, data: bytes) -> JointWorldState:
         """Restore a snapshot; raises InvalidInputError for one of another checkpoint."""
         config = self._model.config
-        max_bytes = config.num_views * MAX_SNAPSHOT_BYTES + kept_bytes(config)
+        max_bytes = config.num_views * predicted_world.MAX_SNAPSHOT_BYTES + kept_bytes(config)
         fields, arrays = predicted_world.opened_snapshot(data, self._digest, max_bytes=max_bytes)
         words, task = fields.get("instruction"), fields.get("task")
         counts: dict[str, Any] = {

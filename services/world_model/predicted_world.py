@@ -37,6 +37,8 @@ from services.world_model.network.inputs import ObjectsAtStart, PredictionReques
 
 # Larger values are mistakes of units or frames.
 MAX_ANCHOR_M, MAX_CAMERA_PX = 5.0, 1e5
+# With one image, of 3 MB at the largest side of 1024 px; snapshots of several views are larger.
+MAX_SNAPSHOT_BYTES = 4 * 2**20
 # A rollout ends once its hands have moved four times the length of a training episode, since no
 # longer ones were trained on, and errors of chunk after chunk add up.
 LAST_HORIZONS = 4
@@ -210,7 +212,7 @@ class PredictedWorld(BatchWorld[State]):
 
 
 def opened_snapshot(
-    data: bytes, digest: str, *, max_bytes: int
+    data: bytes, digest: str, *, max_bytes: int = MAX_SNAPSHOT_BYTES
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Fields and arrays of a snapshot; raises InvalidInputError for one of another digest."""
     fields, arrays = unpack(data, max_bytes=max_bytes)

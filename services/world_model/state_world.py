@@ -34,7 +34,6 @@ from services.world_model.network.inputs import (
 from services.world_model.rendering.rasters import SceneStates
 from services.world_model.rendering.renderer import Drawing, Renderer
 
-MAX_SNAPSHOT_BYTES = 2**20
 # Pose reported for objects believed absent: below the table, where no task places one.
 ABSENT_POSE = np.array([0.0, 0.0, -1.0, 1.0, 0.0, 0.0, 0.0], dtype=np.float32)
 # A rollout is flagged once its hands have moved 1.5 times the length of a training episode.
@@ -310,9 +309,7 @@ class StateWorld(predicted_world.PredictedWorld[StateRollout]):
 
     def restore(self, data: bytes) -> StateRollout:
         """Restore a snapshot; raises InvalidInputError or NonFiniteError for another's."""
-        fields, arrays = predicted_world.opened_snapshot(
-            data, self._digest, max_bytes=MAX_SNAPSHOT_BYTES
-        )
+        fields, arrays = predicted_world.opened_snapshot(data, self._digest)
         config, name = self._metadata.dynamics, fields.get("task")
         step, moving = fields.get("step"), fields.get("num_moving")
         size = (config.image_px, config.image_px, 3)

@@ -120,12 +120,10 @@ def evaluate_prediction(
 
 
 def refuse_trained(
-    episodes: Sequence[joint_dataset.TrainingEpisode],
-    train_fingerprints: Collection[str],
-    model: str,
+    episodes: Sequence[joint_dataset.TrainingEpisode], fingerprints: Collection[str], model: str
 ) -> None:
     """Raise if a model was trained on any of the episodes, by the hash of their content."""
-    trained = set(train_fingerprints)
+    trained = set(fingerprints)
     seen = [episode.episode_id for episode in episodes if episode.fingerprint() in trained]
     if seen:
         raise InvalidInputError(

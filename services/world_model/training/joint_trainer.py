@@ -44,7 +44,7 @@ from services.world_model.training.joint_objective import (
 )
 from services.world_model.training.tokenizer_trainer import check_unseen, with_tokenizer
 
-LOG_EVERY_STEPS = 20
+LOG_EVERY_STEPS = 20  # rows of a report's `log`, kept for resumed runs, too
 
 
 @dataclass(frozen=True)
