@@ -66,9 +66,9 @@ from services.world_model.dynamics.features import (
 )
 from services.world_model.dynamics.model import first_steps
 from services.world_model.dynamics.start_reader import TASK_WIDTH, FirstStep, Reading, StartReader
-from services.world_model.dynamics.trees import combined, mapped
+from services.world_model.dynamics.tensor_trees import combined, mapped
+from services.world_model.predicted_world import observed_start
 from services.world_model.settings import ReaderSettings
-from services.world_model.starts import observed_start
 from services.world_model.training.reader_training import read_step, train_reader
 from services.world_model.training.scene_table import SceneTable, scene_table, vocabulary
 

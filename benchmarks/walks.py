@@ -219,7 +219,7 @@ def window_into_training(store_url: str) -> Walk:
     """From an episode of a store to the network's input, as the streaming loader reads it."""
     from services.world_model.network.configuration import NetworkConfig
     from services.world_model.network.inputs import build_inputs
-    from services.world_model.training.dataset import WindowPosition, index_episodes
+    from services.world_model.training.joint_dataset import WindowPosition, index_episodes
 
     (episode, *_) = index_episodes(store_url)
     tracer = Tracer("window into training")

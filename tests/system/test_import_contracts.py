@@ -30,7 +30,7 @@ OFFENCES = [
     (
         "Layers of the world model",
         "services/world_model/network/conditioning.py",
-        "import services.world_model.training.trainer",
+        "import services.world_model.training.joint_trainer",
     ),
     (
         "Layers of alignment",

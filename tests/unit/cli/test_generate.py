@@ -13,7 +13,7 @@ from services.twin.episodes import TakeOptions, record, write_episode
 from services.twin.settings import TwinSettings
 from services.twin.stage import Stage
 from services.world_model.checkpoints import write_state_checkpoint
-from services.world_model.training.dataset import load_episodes
+from services.world_model.training.joint_dataset import load_episodes
 from tests.contracts.test_world import untrained_state_checkpoint
 
 pytestmark = pytest.mark.long
