@@ -21,6 +21,7 @@ from dextouch.episodes import (
 from dextouch.errors import ConflictError, DexTouchError, InvalidInputError, NotFoundError
 from dextouch.schemas import first_problems
 from services.pipelines.parsers import (
+    EXPORT_FILTERS,
     JOINT_FORMATS,
     check_format_options,
     export_parser,
@@ -36,11 +37,6 @@ Report = dict[str, Any]
 DamagedImages = dict[str, dict[str, list[int]]]
 # Exit status if some of several files were refused, as of a command that is.
 _SOME_FAILED = 3
-# Options that choose items, as on the dashboard's list.
-FILTERS = (
-    "text", "task", "operator", "station", "domain", "outcome", "origin", "review", "after",
-    "before",
-)  # fmt: skip
 # Of damaged images, in a message; the JSON report has all.
 MAX_NAMED = 20
 
@@ -93,7 +89,9 @@ def _export_all(readers: Iterator[EpisodeReader], options: argparse.Namespace) -
 
 def _ids(store: EpisodeStore, options: argparse.Namespace) -> list[str]:
     """The given ids, or those that match the filters and were not rejected in review."""
-    criteria = {key: value for key in FILTERS if (value := getattr(options, key)) is not None}
+    criteria = {
+        key: value for key in EXPORT_FILTERS if (value := getattr(options, key)) is not None
+    }
     if options.ids and criteria:
         raise InvalidInputError(f"got ids and filters {sorted(criteria)}; expected one of the two")
     if len(set(options.ids)) != len(options.ids):

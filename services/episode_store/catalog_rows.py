@@ -18,8 +18,16 @@ from dextouch.episodes import (
     has_object_poses,
 )
 from dextouch.errors import CorruptDataError
-from dextouch.schemas import EpisodeClicks, EpisodeSummary, LineageEntry, RecordingSummary, Review
+from dextouch.schemas import (
+    SHARED_ATTRIBUTES,
+    EpisodeClicks,
+    EpisodeSummary,
+    LineageEntry,
+    RecordingSummary,
+    Review,
+)
 from services.episode_store.filters import (
+    EQUALITY_FILTERS,
     NO_WEIGHT,
     WEIGHTS,
     item_name,
@@ -107,10 +115,7 @@ def read_row(store: EpisodeStore, kind: Kind, item_id: str, stamps: Stamps) -> I
     is_clickable = isinstance(reader, EpisodeReader) and _is_clickable(reader)
     review, clicks = read_remarks(store, kind, item_id)
     parts = (item_id, about.task, about.instruction, about.operator, about.station, about.trace_id)
-    names = (
-        "kind", "id", "task", "operator", "station", "domain", "origin", "success", "recovered",
-        "trace_id", "complete", "duration_s",
-    )  # fmt: skip
+    names = ("kind", "id", *EQUALITY_FILTERS, "complete", "duration_s")
     columns: dict[str, object] = {name: getattr(item, name) for name in names}
     columns |= stamps._asdict() | {
         "name": item_name(item_id, kind),
@@ -193,7 +198,7 @@ def _is_clickable(reader: EpisodeReader) -> bool:
 
 def _shared_fields(reader: EpisodeReader | RecordingReader) -> dict[str, Any]:
     """The fields that the summaries of both kinds have under one name."""
-    names = ("task", "domain", "station", "operator", "success", "recovered")
+    names = EpisodeSummary.model_fields.keys() & SHARED_ATTRIBUTES
     fields = {name: getattr(reader.attributes, name) for name in names}
     return fields | {"content_sha256": reader.content_sha256}
 

@@ -107,6 +107,21 @@ def _parsed(text: str, form: Any, expected: str) -> Any:  # noqa: ANN401 - of th
         raise argparse.ArgumentTypeError(f"got {text!r}, expected {expected}") from error
 
 
+# Options that choose items, as on the dashboard's list.
+EXPORT_FILTERS: dict[str, dict[str, Any]] = {
+    "text": {"metavar": "TEXT", "help": "in id, task, instruction, operator, station or trace"},
+    "task": {"metavar": "TASK", "help": "of this task"},
+    "operator": {"metavar": "P", "help": "of this operator"},
+    "station": {"metavar": "NAME", "help": "of this station"},
+    "domain": {"choices": ("human", "robot"), "help": "of this domain"},
+    "outcome": {"choices": ("success", "failure", "not_judged"), "help": "with this outcome"},
+    "origin": {"choices": ("recorded", "twin", "imagined"), "help": "of this origin"},
+    "review": {"choices": ("accepted", "rejected", "not_reviewed"), "help": "with this review"},
+    "after": {"type": _moment, "metavar": "DAY", "help": "recorded on this day or later"},
+    "before": {"type": _moment, "metavar": "DAY", "help": "recorded before this day"},
+}
+
+
 def training_data_parser() -> argparse.ArgumentParser:
     """Parser of `dextouch train data`."""
     parser = _parser("train data")
@@ -279,17 +294,8 @@ def _bridge_parser(command: str) -> argparse.ArgumentParser:
 def _add_filters(parser: argparse.ArgumentParser) -> None:
     about = "only items that match all of them; a DAY may be a time, too"
     add = parser.add_argument_group("filters", about).add_argument
-    add("--text", metavar="TEXT", help="in id, task, instruction, operator, station or trace")
-    add("--task", metavar="TASK", help="of this task")
-    add("--operator", metavar="P", help="of this operator")
-    add("--station", metavar="NAME", help="of this station")
-    add("--domain", choices=("human", "robot"), help="of this domain")
-    add("--outcome", choices=("success", "failure", "not_judged"), help="with this outcome")
-    add("--origin", choices=("recorded", "twin", "imagined"), help="of this origin")
-    reviews = ("accepted", "rejected", "not_reviewed")
-    add("--review", choices=reviews, help="with this review")
-    add("--after", type=_moment, metavar="DAY", help="recorded on this day or later")
-    add("--before", type=_moment, metavar="DAY", help="recorded before this day")
+    for name, words in EXPORT_FILTERS.items():
+        add(f"--{name}", **words)
 
 
 def export_parser() -> argparse.ArgumentParser:

@@ -10,7 +10,14 @@ from jaxtyping import Bool, Float64
 from dextouch.episodes import RecordingReader
 from dextouch.errors import InvalidInputError
 from dextouch.geometry import nearest_index
-from dextouch.schemas import Domain, EpisodeAttributes, LineageEntry, Matrix, StoredAnchor
+from dextouch.schemas import (
+    SHARED_ATTRIBUTES,
+    Domain,
+    EpisodeAttributes,
+    LineageEntry,
+    Matrix,
+    StoredAnchor,
+)
 from dextouch.streams import (
     BODIES,
     COMMANDED,
@@ -61,11 +68,6 @@ from services.alignment.synchronization.resampling import (
 
 # Samples without which a stream is as if it were not there.
 MIN_USABLE = 2
-# What an episode takes over from its recording.
-SHARED_ATTRIBUTES = (
-    *("task", "instruction", "domain", "station", "operator", "trace_id"),
-    *("success", "recovered", "complete", "incomplete_cause"),
-)
 
 
 @dataclass(frozen=True)
