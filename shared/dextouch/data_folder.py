@@ -47,6 +47,11 @@ def default_spool() -> Path:
     return data_folder() / "spool"
 
 
+def is_bucket_url(url: str | Path) -> bool:
+    """Whether a store's URL is that of a bucket, s3://…, and not a folder."""
+    return isinstance(url, str) and url.startswith("s3://")
+
+
 def practice_spool(spool: Path) -> Path:
     """Where takes of the practice devices of a station are kept, beside its own."""
     return spool.with_name(f"{spool.name}_practice")

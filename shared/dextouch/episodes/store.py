@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import unquote, urlsplit
 
+from dextouch.data_folder import is_bucket_url
 from dextouch.episodes.files import (
     GroupFiles,
     LocalGroup,
@@ -72,7 +73,6 @@ if TYPE_CHECKING:
     from dextouch.episodes.object_storage import ObjectStorage
 
 
-_OBJECT_SCHEME = "s3://"
 _IS_ID = re.compile(ID_PATTERN).fullmatch
 
 
@@ -358,7 +358,7 @@ def _open_storage(
     url: str | Path, storage_options: Mapping[str, str]
 ) -> "_LocalStorage | ObjectStorage":
     """Storage backend for a URL; see `EpisodeStore` for the arguments."""
-    if isinstance(url, str) and url.startswith(_OBJECT_SCHEME):
+    if is_bucket_url(url):
         # Imported lazily, so that a local store does not need obstore.
         try:
             from dextouch.episodes.object_storage import ObjectStorage
