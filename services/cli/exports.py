@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import ValidationError
 
+from dextouch.bridges.formats import FORMATS
 from dextouch.command_line import progress, write_result
 from dextouch.data_folder import is_system_file
 from dextouch.episodes import (
@@ -22,7 +23,6 @@ from dextouch.errors import ConflictError, DexTouchError, InvalidInputError, Not
 from dextouch.schemas import first_problems
 from services.pipelines.parsers import (
     EXPORT_FILTERS,
-    JOINT_FORMATS,
     check_format_options,
     export_parser,
     import_parser,
@@ -41,11 +41,13 @@ _SOME_FAILED = 3
 MAX_NAMED = 20
 
 
-def _export_one(reader: Reader, path: Path, options: argparse.Namespace) -> int:
-    if options.format == "rrd":
-        from dextouch.bridges.rerun import export_rrd
+def _export_rrd(reader: Reader, path: Path, options: argparse.Namespace) -> int:
+    from dextouch.bridges.rerun import export_rrd
 
-        return export_rrd(reader, path, overwrite=options.force)
+    return export_rrd(reader, path, overwrite=options.force)
+
+
+def _export_mcap(reader: Reader, path: Path, options: argparse.Namespace) -> int:
     from dextouch.bridges.mcap import export_mcap
 
     return export_mcap(
@@ -57,12 +59,13 @@ def _export_one(reader: Reader, path: Path, options: argparse.Namespace) -> int:
     )
 
 
-def _export_all(readers: Iterator[EpisodeReader], options: argparse.Namespace) -> Report:
-    """Write all episodes together; the report's part about them."""
-    if options.format == "umi":
-        from dextouch.bridges.umi import export_umi
+def _export_umi(readers: Iterator[EpisodeReader], options: argparse.Namespace) -> Report:
+    from dextouch.bridges.umi import export_umi
 
-        return {"num_steps": export_umi(readers, options.to, overwrite=options.force)}
+    return {"num_steps": export_umi(readers, options.to, overwrite=options.force)}
+
+
+def _export_lerobot(readers: Iterator[EpisodeReader], options: argparse.Namespace) -> Report:
     from dextouch.bridges.lerobot import ExportOptions, export_dataset
 
     chosen = ExportOptions(
@@ -85,6 +88,11 @@ def _export_all(readers: Iterator[EpisodeReader], options: argparse.Namespace) -
         "present": list(done.present),
         "num_touch_left_out": done.num_touch_left_out,
     }
+
+
+# Write one item and return the number of messages; write all episodes, and the report about them.
+_EXPORT_ONE = {"mcap": _export_mcap, "rrd": _export_rrd}
+_EXPORT_ALL = {"umi": _export_umi, "lerobot": _export_lerobot}
 
 
 def _ids(store: EpisodeStore, options: argparse.Namespace) -> list[str]:
@@ -170,7 +178,7 @@ def _episodes(
 def _export(options: argparse.Namespace) -> Report:
     store, to, form = EpisodeStore(options.store), options.to, options.format
     check_format_options(export_parser(), options, form)
-    if form in JOINT_FORMATS and options.kind == "recording":
+    if FORMATS[form].is_joint and options.kind == "recording":
         raise InvalidInputError(
             f"format {form!r} holds episodes only; export recordings as mcap or rrd"
         )
@@ -178,9 +186,9 @@ def _export(options: argparse.Namespace) -> Report:
     damaged: DamagedImages = {}
     report: Report = {"format": form, "kind": options.kind, "ids": ids, "damaged_images": damaged}
     tracked = progress(ids, f"export {form}", len(ids))
-    if form in JOINT_FORMATS:
+    if FORMATS[form].is_joint:
         left_out: list[str] = []
-        done = _export_all(_episodes(store, tracked, damaged, left_out), options)
+        done = _EXPORT_ALL[form](_episodes(store, tracked, damaged, left_out), options)
         num_new = len(ids) - len(left_out) - len(done.get("present", []))
         print(f"{to}  {num_new} episodes  {done['num_steps']} steps")
         return report | done | {"path": str(to), "left_out": left_out}
@@ -190,7 +198,7 @@ def _export(options: argparse.Namespace) -> Report:
     for item_id in tracked:
         reader = store.open_item(options.kind, item_id)
         _note_damaged(reader, damaged)
-        count = _export_one(reader, paths[item_id], options)
+        count = _EXPORT_ONE[form](reader, paths[item_id], options)
         files.append({"id": item_id, "path": str(paths[item_id]), "num_messages": count})
         print(f"{paths[item_id]}  {count} messages")
         exported.append(reader.attributes)

@@ -4,6 +4,7 @@ __all__ = [
     "foreign",
     "foreign_mcap",
     "foreign_rerun",
+    "formats",
     "foxglove",
     "lerobot",
     "mcap",
