@@ -14,7 +14,7 @@ from typing import Final
 import structlog
 
 from dextouch.episodes import held_folder
-from dextouch.episodes.care import CATALOG_FOLDER, remove_catalog
+from dextouch.episodes.maintenance import CATALOG_FOLDER, remove_catalog
 from services.episode_store.filters import COUNTED_ATTRIBUTES, NO_WEIGHT, SORT_COLUMNS
 
 logger = structlog.get_logger(__name__)

@@ -12,9 +12,9 @@ import structlog
 from dextouch.episodes import (
     EpisodeReader,
     EpisodeStore,
+    GroupFingerprint,
     Kind,
     RecordingReader,
-    Stamps,
     has_object_poses,
 )
 from dextouch.errors import CorruptDataError
@@ -101,7 +101,9 @@ class ItemRow:
     results: tuple[str, ...]
 
 
-def read_row(store: EpisodeStore, kind: Kind, item_id: str, stamps: Stamps) -> ItemRow:
+def read_row(
+    store: EpisodeStore, kind: Kind, item_id: str, fingerprint: GroupFingerprint
+) -> ItemRow:
     """Read an item; raises as `EpisodeStore.open`."""
     reader = store.open_item(kind, item_id)
     about = reader.attributes
@@ -117,7 +119,7 @@ def read_row(store: EpisodeStore, kind: Kind, item_id: str, stamps: Stamps) -> I
     parts = (item_id, about.task, about.instruction, about.operator, about.station, about.trace_id)
     names = ("kind", "id", *EQUALITY_FILTERS, "complete", "duration_s")
     columns: dict[str, object] = {name: getattr(item, name) for name in names}
-    columns |= stamps._asdict() | {
+    columns |= fingerprint._asdict() | {
         "name": item_name(item_id, kind),
         "sha256": reader.content_sha256,
         "at_us": None if at is None else microseconds(at),
@@ -249,7 +251,7 @@ def write_remarks(
     connection: sqlite3.Connection,
     *,
     name: tuple[Kind, str],
-    stamps: Stamps,
+    fingerprint: GroupFingerprint,
     review: Review | None,
     clicks: EpisodeClicks | None,
 ) -> None:
@@ -260,7 +262,7 @@ def write_remarks(
     connection.execute(
         "UPDATE item SET folder = ?, content = ?, remarks = ?, own_verdict = ?, "
         "earlier_verdict = ?, is_superseded = ?, is_dirty = 1 WHERE row = ?",
-        (*stamps, *_verdicts(review).values(), *found),
+        (*fingerprint, *_verdicts(review).values(), *found),
     )
     connection.execute(
         "UPDATE body SET review = ?, clicks = ? WHERE row = ?",

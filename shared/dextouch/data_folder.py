@@ -2,6 +2,7 @@
 
 import os
 from pathlib import Path, PurePath
+from typing import TypeGuard
 
 from dextouch.errors import InvalidInputError, LimitExceededError, NotFoundError, StorageError
 
@@ -47,7 +48,7 @@ def default_spool() -> Path:
     return data_folder() / "spool"
 
 
-def is_bucket_url(url: str | Path) -> bool:
+def is_bucket_url(url: str | Path) -> TypeGuard[str]:
     """Whether a store's URL is that of a bucket, s3://…, and not a folder."""
     return isinstance(url, str) and url.startswith("s3://")
 

@@ -22,7 +22,7 @@ from mcap.writer import CompressionType, Writer
 from pydantic import ValidationError
 
 from dextouch import __version__
-from dextouch.bridges.exporting import (
+from dextouch.bridges.export_files import (
     Block,
     Reader,
     TouchPictures,

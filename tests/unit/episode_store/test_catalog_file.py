@@ -15,7 +15,7 @@ import pytest
 from structlog.testing import capture_logs
 
 from dextouch.episodes import EpisodeStore
-from dextouch.episodes.care import DeletionRequest, delete_for_good
+from dextouch.episodes.maintenance import DeletionRequest, delete_for_good
 from dextouch.schemas import Review
 from services.episode_store import catalog_file, catalog_index, command_line
 from services.episode_store.catalog import Catalog
@@ -276,7 +276,7 @@ def test_a_deleted_operator_is_in_no_byte_of_it(store, tmp_path, is_open):
 
 
 def test_what_names_a_deleted_operator_is_searched_for(store, tmp_path, monkeypatch):
-    from dextouch.episodes.care import deletion
+    from dextouch.episodes.maintenance import deletion
 
     ids(Catalog(store))
     monkeypatch.setattr(deletion, "erase_from_catalog", lambda *_: None)

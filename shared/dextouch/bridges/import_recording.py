@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from dextouch import __version__
-from dextouch.bridges.exporting import Block
+from dextouch.bridges.export_files import Block
 from dextouch.bridges.formats import FILE_SIGNATURES
 from dextouch.episodes import EpisodeStore, EpisodeWriter, disk_errors
 from dextouch.errors import ConflictError, InvalidInputError, UnknownNameError

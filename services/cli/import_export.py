@@ -29,7 +29,7 @@ from services.pipelines.parsers import (
 )
 
 if TYPE_CHECKING:
-    from dextouch.bridges.foreign import ImportReport
+    from dextouch.bridges.import_recording import ImportReport
 
 Reader = EpisodeReader | RecordingReader
 Report = dict[str, Any]
@@ -254,7 +254,7 @@ def _import(options: argparse.Namespace) -> Report:
     store, path = EpisodeStore(options.store), options.path
     if not path.exists():
         raise NotFoundError(f"{path}: no such file or folder")
-    from dextouch.bridges.foreign import find_format
+    from dextouch.bridges.import_recording import find_format
 
     form = options.format or find_format(path)
     check_format_options(import_parser(), options, form)
@@ -301,7 +301,7 @@ def _import(options: argparse.Namespace) -> Report:
 def _import_file(
     path: Path, store: EpisodeStore, form: str, options: argparse.Namespace
 ) -> "ImportReport":
-    from dextouch.bridges.foreign import ImportAttributes
+    from dextouch.bridges.import_recording import ImportAttributes
     from dextouch.tactile.layout import read_layout
 
     about = ImportAttributes(
@@ -314,10 +314,10 @@ def _import_file(
         layout=None if options.layout is None else read_layout(options.layout),
     )
     if form == "rrd":
-        from dextouch.bridges.foreign_rerun import import_rrd
+        from dextouch.bridges.import_rerun import import_rrd
 
         return import_rrd(path, store, about, timeline=options.timeline)
-    from dextouch.bridges.foreign_mcap import import_any_mcap
+    from dextouch.bridges.import_mcap import import_any_mcap
 
     return import_any_mcap(path, store, about)
 
