@@ -97,9 +97,8 @@ _EXPORT_ALL = {"umi": _export_umi, "lerobot": _export_lerobot}
 
 def _ids(store: EpisodeStore, options: argparse.Namespace) -> list[str]:
     """The given ids, or those that match the filters and were not rejected in review."""
-    criteria = {
-        key: value for key in EXPORT_FILTERS if (value := getattr(options, key)) is not None
-    }
+    given = vars(options)
+    criteria = {key: given[key] for key in EXPORT_FILTERS if given[key] is not None}
     if options.ids and criteria:
         raise InvalidInputError(f"got ids and filters {sorted(criteria)}; expected one of the two")
     if len(set(options.ids)) != len(options.ids):

@@ -9,6 +9,7 @@ from typing import Any, Final
 import numpy as np
 import structlog
 
+from dextouch import schemas
 from dextouch.episodes import (
     EpisodeReader,
     EpisodeStore,
@@ -18,14 +19,6 @@ from dextouch.episodes import (
     has_object_poses,
 )
 from dextouch.errors import CorruptDataError
-from dextouch.schemas import (
-    SHARED_ATTRIBUTES,
-    EpisodeClicks,
-    EpisodeSummary,
-    LineageEntry,
-    RecordingSummary,
-    Review,
-)
 from services.episode_store.filters import (
     EQUALITY_FILTERS,
     NO_WEIGHT,
@@ -96,7 +89,7 @@ class ItemRow:
 
     item: Mapping[str, object]
     body: Mapping[str, object]
-    lineage: tuple[LineageEntry, ...]
+    lineage: tuple[schemas.LineageEntry, ...]
     quality: Mapping[str, float]
     results: tuple[str, ...]
 
@@ -107,7 +100,7 @@ def read_row(
     """Read an item; raises as `EpisodeStore.open`."""
     reader = store.open_item(kind, item_id)
     about = reader.attributes
-    summary: EpisodeSummary | RecordingSummary
+    summary: schemas.EpisodeSummary | schemas.RecordingSummary
     if isinstance(reader, EpisodeReader):
         summary, at = _episode(reader), reader.attributes.created_at
     else:
@@ -126,9 +119,9 @@ def read_row(
         "at_key": time_key(at),
         "duration_key": number_key(item.duration_s),
         "size": summary.num_steps
-        if isinstance(summary, EpisodeSummary)
+        if isinstance(summary, schemas.EpisodeSummary)
         else sum(summary.num_samples.values()),
-        "num_bytes": summary.num_bytes if isinstance(summary, RecordingSummary) else None,
+        "num_bytes": summary.num_bytes if isinstance(summary, schemas.RecordingSummary) else None,
         "beyond_limit": bool(item.findings),
         "in_doubt": bool(item.time_doubts),
         "is_clickable": is_clickable,
@@ -150,7 +143,7 @@ def read_row(
 
 def read_remarks(
     store: EpisodeStore, kind: Kind, item_id: str
-) -> tuple[Review | None, EpisodeClicks | None]:
+) -> tuple[schemas.Review | None, schemas.EpisodeClicks | None]:
     """Review of an item and clicks of an episode; None, with a line of the log, if damaged."""
     review, clicks = None, None
     for name in ("review", "clicks")[: 1 + (kind == "episode")]:
@@ -164,9 +157,9 @@ def read_remarks(
     return review, clicks
 
 
-def _episode(reader: EpisodeReader) -> EpisodeSummary:
+def _episode(reader: EpisodeReader) -> schemas.EpisodeSummary:
     attributes, num_steps = reader.attributes, reader.num_steps
-    return EpisodeSummary(
+    return schemas.EpisodeSummary(
         episode_id=reader.item_id,
         origin=attributes.origin,
         num_steps=num_steps,
@@ -177,9 +170,9 @@ def _episode(reader: EpisodeReader) -> EpisodeSummary:
     )
 
 
-def _recording(store: EpisodeStore, reader: RecordingReader) -> RecordingSummary:
+def _recording(store: EpisodeStore, reader: RecordingReader) -> schemas.RecordingSummary:
     attributes = reader.attributes
-    return RecordingSummary(
+    return schemas.RecordingSummary(
         recording_id=reader.item_id,
         consent=attributes.consent,
         num_samples={name: reader.num_samples(name) for name in reader.streams},
@@ -200,7 +193,7 @@ def _is_clickable(reader: EpisodeReader) -> bool:
 
 def _shared_fields(reader: EpisodeReader | RecordingReader) -> dict[str, Any]:
     """The fields that the summaries of both kinds have under one name."""
-    names = EpisodeSummary.model_fields.keys() & SHARED_ATTRIBUTES
+    names = schemas.EpisodeSummary.model_fields.keys() & schemas.SHARED_ATTRIBUTES
     fields = {name: getattr(reader.attributes, name) for name in names}
     return fields | {"content_sha256": reader.content_sha256}
 
@@ -252,8 +245,8 @@ def write_remarks(
     *,
     name: tuple[Kind, str],
     fingerprint: GroupFingerprint,
-    review: Review | None,
-    clicks: EpisodeClicks | None,
+    review: schemas.Review | None,
+    clicks: schemas.EpisodeClicks | None,
 ) -> None:
     """Change what people say of an item, by kind and id; `relink` must follow."""
     found = connection.execute("SELECT row FROM item WHERE kind = ? AND id = ?", name).fetchone()
@@ -272,7 +265,7 @@ def write_remarks(
     _insert_results(connection, found[0], () if review is None else review.superseded_by)
 
 
-def _verdicts(review: Review | None) -> dict[str, object]:
+def _verdicts(review: schemas.Review | None) -> dict[str, object]:
     earlier = None if review is None else review.earlier
     return {
         "own_verdict": None if review is None else review.verdict,
@@ -287,7 +280,7 @@ def _insert_results(connection: sqlite3.Connection, row: int, results: tuple[str
     )
 
 
-def _json(remark: Review | EpisodeClicks | None) -> str | None:
+def _json(remark: schemas.Review | schemas.EpisodeClicks | None) -> str | None:
     return None if remark is None else remark.model_dump_json()
 
 

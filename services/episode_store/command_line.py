@@ -222,12 +222,9 @@ def verify(context: Context) -> Outcome:
             say(f"{item_id}  deleted meanwhile  {kind}")
     if not context.options.ids:
         reports += [] if root is None else maintenance.inspect_unfinished(root)
-        reports += [
-            maintenance.ItemReport(
-                "catalog", "catalog", findings=(maintenance.Finding(problem, foreign=True),)
-            )
-            for problem in Catalog(context.store).index.verify()
-        ]
+        for problem in Catalog(context.store).index.verify():
+            finding = maintenance.Finding(problem, foreign=True)
+            reports.append(maintenance.ItemReport("catalog", "catalog", findings=(finding,)))
     for report in reports:
         _say_report(report)
     damaged = {r.item_id: "; ".join(f.message for f in r.findings) for r in reports if r.damaged}
@@ -453,10 +450,8 @@ def repair(context: Context) -> Outcome:
     root, options = context.need_local_root(), context.options
     copies = EpisodeStore(options.source) if options.source else None
     reports = [] if options.ids else maintenance.repair_uploads(root)
-    for kind, item_id in context.items():
-        reports.append(
-            maintenance.repair_group(root, kind, item_id, copy=_copy(copies, kind, item_id))
-        )
+    for kind, name in context.items():
+        reports.append(maintenance.repair_group(root, kind, name, copy=_copy(copies, kind, name)))
     for report in reports:
         say(f"{report.item_id}  {report.action}" + f"  as {report.new_id}" * bool(report.new_id))
         for name, count in report.lost.items():

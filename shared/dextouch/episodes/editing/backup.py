@@ -261,9 +261,8 @@ class _Backup:
                 files = LocalGroup(entry.folder)
                 files.item_id = entry.item_id
                 with suppress(StorageError):
-                    if deletion_of(
-                        records, maintenance.open_contents(files, entry.kind).attributes
-                    ):
+                    contents = maintenance.open_contents(files, entry.kind)
+                    if deletion_of(records, contents.attributes):
                         remove_for_good(entry.folder)
                         self._note(BackupReport(entry.kind, entry.item_id, "erased"))
         if any(one.action == "erased" for one in self.reports):
