@@ -87,9 +87,9 @@ def test_demonstrations_are_imagined_whole(generate, truth, tmp_path):
     assert source in page
     assert page.count("data:image/png") == 2 * 2 * 8
     # Once more: nothing is made anew.
-    stamps = target.stamps({made[0]: 0})
+    before = target.fingerprints({made[0]: 0})
     assert generate(seeds="4:5") == (0, made)
-    assert target.stamps({made[0]: 0}) == stamps
+    assert target.fingerprints({made[0]: 0}) == before
 
 
 def test_scenes_of_the_world_model_are_refused(generate, truth, capsys):
