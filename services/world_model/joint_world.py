@@ -109,9 +109,9 @@ class JointWorldState(predicted_world.ObservedStart):
 class JointWorld(predicted_world.PredictedWorld[JointWorldState]):
     """A flow-matching model as a world.
 
-    With contact geometry, `reader` finds objects at a chunk's start. A scene is at rest, bit for bit
-    and without the network, in chunks without motion that follow two seconds without motion, or a
-    start at which the hands touch nothing.
+    With contact geometry, `reader` finds objects at a chunk's start. A scene is at rest, bit for
+    bit and without the network, in chunks without motion that follow two seconds without motion, or
+    a start at which the hands touch nothing.
 
     Raises:
         InvalidInputError: a model with contact geometry, and no reader of all its tasks and of the
