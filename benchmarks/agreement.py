@@ -143,7 +143,7 @@ def coverage(
                 shortest = method == OURS and name in CORRELATIONS
                 interval = (shortest_interval if shortest else central_interval)(defined)
                 # A true value at its limit (r = 1) counts as covered within a thousandth.
-                hit = interval.low - 1e-3 <= FIGURES[name](**truth) <= interval.high + 1e-3
+                hit = interval.low - 1e-3 <= FIGURES[name].compute(**truth) <= interval.high + 1e-3
                 held[method, name].append((hit, interval.high - interval.low))
     return {
         key: Tally(

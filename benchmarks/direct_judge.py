@@ -35,7 +35,7 @@ from dextouch.episodes import (
 from dextouch.errors import InvalidInputError
 from dextouch.schemas import MAX_OBJECTS, RolloutStart
 from dextouch.streams import HEAD_CAMERA
-from services.evaluation.calibration import (
+from services.evaluation.classifier_calibration import (
     MIN_OUTCOMES,
     expected_calibration_error,
     fit_calibration,
@@ -66,9 +66,9 @@ from services.world_model.dynamics.features import (
 )
 from services.world_model.dynamics.model import first_steps
 from services.world_model.dynamics.start_reader import TASK_WIDTH, FirstStep, Reading, StartReader
-from services.world_model.dynamics.trees import combined, mapped
+from services.world_model.dynamics.tensor_trees import combined, mapped
+from services.world_model.predicted_world import observed_start
 from services.world_model.settings import ReaderSettings
-from services.world_model.starts import observed_start
 from services.world_model.training.reader_training import read_step, train_reader
 from services.world_model.training.scene_table import SceneTable, scene_table, vocabulary
 

@@ -18,8 +18,8 @@ from services.pipelines.training_data import Scope, make_training_data
 from services.twin.take_options import MIXES
 from services.twin.tasks import TASK_NAMES
 from services.world_model.paper_settings import TrainSettings
-from services.world_model.training.dataset import WindowBatch, index_episodes, read_batches
-from services.world_model.training.trainer import TrainingRun
+from services.world_model.training.joint_dataset import WindowBatch, index_episodes, read_batches
+from services.world_model.training.joint_trainer import TrainingRun
 
 MIN_RATIO = 3.0
 # Default of `dextouch train world-model --streaming`.

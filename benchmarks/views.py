@@ -24,13 +24,13 @@ from services.twin.simulation import MODEL_RATE_HZ
 from services.twin.stage import Stage, command_row
 from services.twin.take_options import MIXES, options_of
 from services.world_model import checkpoints
+from services.world_model.joint_world import JointWorld
 from services.world_model.network.configuration import FRAMES_PER_LATENT, NetworkConfig
 from services.world_model.network.model import JointWorldModel
 from services.world_model.paper_settings import TrainSettings
-from services.world_model.training import dataset
+from services.world_model.training import joint_dataset
 from services.world_model.training.evaluation import predict_all
-from services.world_model.training.trainer import TrainingRun
-from services.world_model.world import ModelWorld
+from services.world_model.training.joint_trainer import TrainingRun
 
 WRISTS: Final = ("camera_wrist_left", "camera_wrist_right")
 _AMOUNTS: Final = Amounts(
@@ -72,7 +72,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         for seed in range(amounts["seeds"]):
             for name, config in (("without past images", small), ("with one past image", past)):
                 step(f"{name}, seed {seed}")
-                world = ModelWorld(train(scenes, config, seed))
+                world = JointWorld(train(scenes, config, seed))
                 found = [_looked_back(world, scene) for scene in unseen]
                 for part, errors in zip(_PARTS, zip(*found, strict=True), strict=True):
                     results.setdefault(f"{name}, {part}", []).append(list(errors))
@@ -123,7 +123,7 @@ def _differences(each: dict[str, np.ndarray], base: str, other: str) -> Sequence
 
 
 def _trained(
-    episodes: Sequence[dataset.EpisodeArrays],
+    episodes: Sequence[joint_dataset.EpisodeArrays],
     config: NetworkConfig,
     seed: int,
     *,
@@ -158,7 +158,7 @@ def _trained(
     return checkpoints.read_checkpoint(output)
 
 
-def _scenes(seeds: range) -> list[dataset.EpisodeArrays]:
+def _scenes(seeds: range) -> list[joint_dataset.EpisodeArrays]:
     """Scenes of the twin with still hands, from which the head looks away and back."""
     stages = [
         Stage(task, "robot", TwinSettings(image_height_px=16, image_width_px=16))
@@ -167,7 +167,7 @@ def _scenes(seeds: range) -> list[dataset.EpisodeArrays]:
     return [_scene(stages[seed % len(stages)], seed) for seed in seeds]
 
 
-def _scene(stage: Stage, seed: int) -> dataset.EpisodeArrays:
+def _scene(stage: Stage, seed: int) -> joint_dataset.EpisodeArrays:
     stage.dress(seed, varied=True)
     plan = stage.plan(seed, varied=True)
     anchor = stage.start(plan)
@@ -184,7 +184,7 @@ def _scene(stage: Stage, seed: int) -> dataset.EpisodeArrays:
         grid.sample()
         images.append(stage.rig.image(simulation, HEAD_CAMERA))
         touch.append(simulation.tactile_kpa)
-    return dataset.EpisodeArrays(
+    return joint_dataset.EpisodeArrays(
         episode_id=f"{stage.task.name}-{seed}",
         task=stage.task.name,
         instruction=stage.task.instruction,
@@ -214,7 +214,7 @@ def _yaw(angle_rad: float) -> Float64[np.ndarray, "4 4"]:
     return transform(np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]), np.zeros(3))
 
 
-def _looked_back(world: ModelWorld, scene: dataset.EpisodeArrays) -> tuple[float, float]:
+def _looked_back(world: JointWorld, scene: joint_dataset.EpisodeArrays) -> tuple[float, float]:
     """Errors of the images of a rollout's second chunk, in which the head comes back.
 
     Of all its images, and of the last four, when the head is back.
@@ -238,7 +238,7 @@ def _looked_back(world: ModelWorld, scene: dataset.EpisodeArrays) -> tuple[float
     return float(square.mean()), float(square[-FRAMES_PER_LATENT:].mean())
 
 
-def _takes(seeds: range, folder: Path) -> list[dataset.EpisodeArrays]:
+def _takes(seeds: range, folder: Path) -> list[joint_dataset.EpisodeArrays]:
     """Takes with noise, from a store that has the wrist cameras, too."""
     store = EpisodeStore(folder)
     for task in _TOUCH_TASKS:
@@ -247,18 +247,19 @@ def _takes(seeds: range, folder: Path) -> list[dataset.EpisodeArrays]:
             options = options_of(task, seed, MIXES["ladder"])
             options = replace(options, image_every=1, streams="training")
             write_episode(store, record(stage, seed, options))
-    return dataset.load_episodes(str(folder), further_views=WRISTS)
+    return joint_dataset.load_episodes(str(folder), further_views=WRISTS)
 
 
-def _head_alone(take: dataset.EpisodeArrays) -> dataset.EpisodeArrays:
+def _head_alone(take: joint_dataset.EpisodeArrays) -> joint_dataset.EpisodeArrays:
     return replace(take, further=())
 
 
-def _touch_error(model: JointWorldModel, take: dataset.EpisodeArrays) -> float:
+def _touch_error(model: JointWorldModel, take: joint_dataset.EpisodeArrays) -> float:
     """Error of the touch of all windows of a take that begin at every eighth step."""
     starts = range(0, len(take) - _CHUNK, 8)
     windows = [
-        take.cut(dataset.WindowPosition(0, start, _CHUNK + 1, "commanded")) for start in starts
+        take.cut(joint_dataset.WindowPosition(0, start, _CHUNK + 1, "commanded"))
+        for start in starts
     ]
     found = predict_all(model, [window.request for window in windows]).tactile_kpa
     true = np.stack([window.tactile_kpa[1:] for window in windows])

@@ -37,8 +37,8 @@ from services.acquisition.settings import MockLinks
 from services.acquisition.uploader import Uploader
 from services.episode_store.app import create_app
 from services.episode_store.settings import EpisodeStoreSettings
-from services.evaluation.policies.outside import action_chunk, ask
-from services.evaluation.policies.replay import HoldPolicy
+from services.evaluation.policies.open_loop import HoldPolicy
+from services.evaluation.policies.user_policies import action_chunk, ask
 from services.pipelines.servers import served
 
 TAKE_S = 2.0
@@ -219,7 +219,7 @@ def window_into_training(store_url: str) -> Walk:
     """From an episode of a store to the network's input, as the streaming loader reads it."""
     from services.world_model.network.configuration import NetworkConfig
     from services.world_model.network.inputs import build_inputs
-    from services.world_model.training.dataset import WindowPosition, index_episodes
+    from services.world_model.training.joint_dataset import WindowPosition, index_episodes
 
     (episode, *_) = index_episodes(store_url)
     tracer = Tracer("window into training")

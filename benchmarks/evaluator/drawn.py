@@ -13,10 +13,10 @@ from jaxtyping import Float64
 
 from benchmarks.figures import Requirement, Sense
 from dextouch.errors import ShapeError
-from services.evaluation.calibration import expected_calibration_error
+from services.evaluation.classifier_calibration import expected_calibration_error
+from services.evaluation.rendering import UNDEFINED
 from services.evaluation.scores import undefined_by
 from services.evaluation.statistics import Counts, Interval, central_interval, start_counts
-from services.evaluation.templates import UNDEFINED
 
 
 def interval_of_draws(figures: np.ndarray) -> Interval | None:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from dextouch.errors import InvalidInputError, UnknownNameError
-from services.evaluation.policies.outside import PolicySource
+from services.evaluation.policies.user_policies import PolicySource
 from services.twin import mistakes
 from services.twin.mistakes import DEVELOPMENT, HELD_OUT, KINDS, TRAINING, Mistake
 from services.twin.stage import ELSEWHERE, HOLD, RETREAT, mistake_name, script_name

@@ -25,7 +25,7 @@ from dextouch.streams import HEAD_CAMERA
 from dextouch.tactile import in_contact
 from dextouch.worlds import StartedRollout, State, World
 from services.evaluation.endings import NUM_SEEN_STEPS, Ending
-from services.evaluation.policies.outside import action_chunk, ask
+from services.evaluation.policies.user_policies import action_chunk, ask
 from services.evaluation.prediction_scenes import warp_over_table
 from services.twin.stage import Actions
 from services.twin.world import TwinState, TwinWorld

@@ -15,7 +15,7 @@ from dextouch.schemas import CHUNK_STEPS, Observation
 from dextouch.streams import HEAD_CAMERA
 from services.evaluation.endings import NUM_SEEN_STEPS, Ending, known_objects, object_features
 from services.evaluation.policies.behaviour_cloning import KIND, BehaviourCloningPolicy
-from services.evaluation.policies.replay import HoldPolicy
+from services.evaluation.policies.open_loop import HoldPolicy
 from services.evaluation.success_classifier import SuccessClassifier
 from services.evaluation.trained_networks import Checkpoint, load_checkpoint
 

@@ -16,10 +16,10 @@ from services.world_model.network.flow_matching import MIN_TIME, training_times
 from services.world_model.network.inputs import build_inputs
 from services.world_model.network.model import JointWorldModel
 from services.world_model.paper_settings import OptimizerSettings, TrainSettings, WindowSettings
-from services.world_model.training.dataset import EpisodeArrays, WindowBatch, WindowSampler
 from services.world_model.training.episode_sets import check_disjoint
-from services.world_model.training.objective import Losses, LossOptions, errors, examples_of
-from services.world_model.training.trainer import TrainingRun
+from services.world_model.training.joint_dataset import EpisodeArrays, WindowBatch, WindowSampler
+from services.world_model.training.joint_objective import Losses, LossOptions, errors, examples_of
+from services.world_model.training.joint_trainer import TrainingRun
 
 STAGE = StageCells("training")
 _PX = 32

@@ -11,11 +11,11 @@ from benchmarks.stress.worlds import Subject
 from benchmarks.world_model.coarse import with_coarse_products
 from dextouch.streams import HEAD_CAMERA
 from services.world_model.checkpoints import Checkpoint, read_checkpoint
+from services.world_model.joint_world import JointWorld
 from services.world_model.network.flow_matching import add_noise, sample, shift_time
 from services.world_model.network.inputs import PredictionRequest, build_inputs
 from services.world_model.network.model import JointWorldModel, stack_noise
 from services.world_model.settings import paper_form_checkpoint
-from services.world_model.world import ModelWorld
 
 STAGE = StageCells("world-model")
 # Bounds of the current model in bfloat16; its own touch error is larger.
@@ -46,11 +46,11 @@ def _ends(check: Check) -> None:
 def _precision(check: Check) -> None:
     subject = _subject()
     exact = subject.step(subject.actions[:16])
-    coarse_worlds = {"bfloat16 products": ModelWorld(with_coarse_products(_checkpoint()))}
+    coarse_worlds = {"bfloat16 products": JointWorld(with_coarse_products(_checkpoint()))}
     for dtype in (torch.bfloat16, torch.float16, torch.float64):
         model = read_checkpoint(paper_form_checkpoint()).model.to(dtype)
         checkpoint = Checkpoint(model, _checkpoint().metadata, _checkpoint().digest)
-        coarse_worlds[f"weights {dtype}"] = ModelWorld(checkpoint)
+        coarse_worlds[f"weights {dtype}"] = JointWorld(checkpoint)
     for name, world in coarse_worlds.items():
         coarse = Subject(world, subject.begun).step(subject.actions[:16])
         worlds.check_answer(check, coarse)
@@ -107,7 +107,7 @@ def _checkpoint() -> Checkpoint:
 
 @cache
 def _subject() -> Subject:
-    world = ModelWorld(_checkpoint())
+    world = JointWorld(_checkpoint())
     return Subject(world, worlds.demonstration(world.description.image_width_px))
 
 

@@ -27,11 +27,11 @@ from services.twin.stage import script_name, scripted_actions
 from services.twin.tasks import TASK_NAMES
 from services.twin.world import TwinWorld
 from services.world_model.checkpoints import read_checkpoint, read_state_checkpoint
+from services.world_model.joint_world import JointWorld
 from services.world_model.network.configuration import Precision, Sampler
 from services.world_model.network.model import Sampling
 from services.world_model.settings import PRETRAINED, STATE_MODEL, paper_form_checkpoint
 from services.world_model.state_world import StateWorld
-from services.world_model.world import ModelWorld
 
 
 @dataclass(frozen=True)
@@ -302,14 +302,14 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     checkpoint = read_checkpoint(options.checkpoint or paper_form_checkpoint())
     network = checkpoint.metadata.network
     variants = {
-        one.name: ModelWorld(
+        one.name: JointWorld(
             checkpoint if one.precision == "float32" else with_coarse_products(checkpoint),
             sampling=Sampling(one.steps, one.sampler, keep_context=not one.recomputed),
         )
         for one in VARIANTS
     }
     served = Variant(network.sampling_steps, network.sampler).name
-    world = variants.setdefault(served, ModelWorld(checkpoint))
+    world = variants.setdefault(served, JointWorld(checkpoint))
     tasks = [task for task in TASK_NAMES if task in world.description.tasks]
     if not tasks:
         raise InvalidInputError(

@@ -11,7 +11,7 @@ from structlog.contextvars import bound_contextvars
 
 from dextouch.clients import EpisodeStoreClient
 from dextouch.episodes import ContentDigest, disk_errors, replace_file
-from dextouch.episodes.care import is_held
+from dextouch.episodes.maintenance import is_held
 from dextouch.episodes.spool import SpoolReader, SpoolWriter
 from dextouch.errors import (
     ConflictError,

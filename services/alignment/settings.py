@@ -9,7 +9,7 @@ from typing import Literal
 from pydantic import Field, SecretStr
 
 from dextouch.command_line import RAY_HELP, CommandParser, add_json, positive
-from dextouch.data_folder import data_folder, default_spool, default_store
+from dextouch.data_folder import data_folder, default_spool, default_store, is_bucket_url
 from dextouch.frozen_model import FrozenModel
 from dextouch.schemas import SceneObjects
 from dextouch.serving import ServiceSettings, load_settings, service_config
@@ -166,7 +166,7 @@ class AlignmentSettings(ServiceSettings):
         if self.look_period_s is not None:
             return self.look_period_s
         # Listing a bucket takes a request for every thousand files in it.
-        return 30.0 if self.store_url.startswith("s3://") else 2.0
+        return 30.0 if is_bucket_url(self.store_url) else 2.0
 
 
 def align_parser(settings: AlignmentSettings) -> argparse.ArgumentParser:

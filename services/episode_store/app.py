@@ -10,7 +10,7 @@ import structlog
 from fastapi import FastAPI
 
 from dextouch.episodes import EpisodeStore
-from dextouch.episodes.care import DeletionRecords
+from dextouch.episodes.maintenance import DeletionRecords
 from dextouch.errors import DexTouchError
 from dextouch.schemas import ObjectClicks
 from dextouch.serving import ServedFolder, create_service_app, serve

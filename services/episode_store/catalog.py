@@ -271,7 +271,7 @@ class Catalog:
         where = Condition(terms=["i.kind = 'episode'"])
         query.restrict(where)
         names, rows = ", ".join(by), "tally"
-        if not where.is_tallied or "i.at_us" in names:
+        if not where.is_counted or "i.at_us" in names:
             rows = "(SELECT *, 1 AS num, duration_s * 1e9 AS duration_ns FROM item)"
         text = f"SELECT {names}, {columns} FROM {rows} i WHERE {where.sql} "
         text += f"GROUP BY {names} ORDER BY {names}"
@@ -316,7 +316,7 @@ def _page(
     place = [limit + 1, min(order.page.offset, MAX_LIMIT)]
     if not where.is_rare:
         count = f"SELECT count(*) FROM {where.tables} WHERE {where.sql}"
-        if where.is_tallied:
+        if where.is_counted:
             count = f"SELECT coalesce(sum(num), 0) FROM tally i WHERE {where.sql}"
         (num_matching,) = connection.execute(count, where.values).fetchone()
         later, values = order.go_on(where, (order.key, order.name))

@@ -14,8 +14,8 @@ from typing import Final
 import structlog
 
 from dextouch.episodes import held_folder
-from dextouch.episodes.care import CATALOG_FOLDER, remove_catalog
-from services.episode_store.filters import NO_WEIGHT, SORT_COLUMNS
+from dextouch.episodes.maintenance import CATALOG_FOLDER, remove_catalog
+from services.episode_store.filters import COUNTED_ATTRIBUTES, NO_WEIGHT, SORT_COLUMNS
 
 logger = structlog.get_logger(__name__)
 
@@ -36,17 +36,15 @@ _INDEXES: Final = "".join(
     for name, key in ((name, column.format("")) for name, column in SORT_COLUMNS.items())
 )
 # What lists without other conditions are counted by, and hours are summed by.
-_TALLIED: Final = (
-    "kind", "is_take", "task", "operator", "station", "domain", "origin", "success", "recovered",
-    "verdict", "take_verdict",
-)  # fmt: skip
+_COUNTED: Final = ("kind", "is_take", *COUNTED_ATTRIBUTES, "verdict", "take_verdict")
+_ATTRIBUTE_COLUMNS: Final = ", ".join(f"{name} {kind}" for name, kind in COUNTED_ATTRIBUTES.items())
 
 
-def _tallied(row: str, sign: str) -> str:
+def _count(row: str, sign: str) -> str:
     """Statements of a trigger that add a row of `item` to its sums, or take it away."""
-    names = ", ".join(_TALLIED)
-    values = ", ".join(f"{row}.{name}" for name in _TALLIED)
-    same = " AND ".join(f"{name} IS {row}.{name}" for name in _TALLIED)
+    names = ", ".join(_COUNTED)
+    values = ", ".join(f"{row}.{name}" for name in _COUNTED)
+    same = " AND ".join(f"{name} IS {row}.{name}" for name in _COUNTED)
     duration_ns = f"CAST(round({row}.duration_s * 1e9) AS INTEGER)"
     return f"""INSERT INTO tally ({names}) SELECT {values}
       WHERE NOT EXISTS (SELECT 1 FROM tally WHERE {same});
@@ -62,8 +60,7 @@ _SCHEMA: Final = f"""
 CREATE TABLE item (
   row INTEGER PRIMARY KEY AUTOINCREMENT, kind TEXT NOT NULL, id TEXT NOT NULL, name TEXT NOT NULL,
   folder INTEGER NOT NULL, content TEXT NOT NULL, remarks TEXT NOT NULL, sha256 TEXT NOT NULL,
-  task TEXT NOT NULL, operator TEXT, station TEXT, domain TEXT NOT NULL, origin TEXT NOT NULL,
-  success INTEGER, recovered INTEGER NOT NULL, trace_id TEXT, complete INTEGER NOT NULL,
+  {_ATTRIBUTE_COLUMNS}, trace_id TEXT, complete INTEGER NOT NULL,
   at_us INTEGER, at_key TEXT NOT NULL, duration_s REAL NOT NULL, duration_key TEXT NOT NULL,
   size INTEGER NOT NULL, num_bytes INTEGER,
   beyond_limit INTEGER NOT NULL, in_doubt INTEGER NOT NULL,
@@ -91,11 +88,9 @@ CREATE TABLE grp (
   is_stale INTEGER NOT NULL DEFAULT 1, num_items INTEGER NOT NULL DEFAULT 0, spread BLOB,
   UNIQUE (task, domain, origin, kind));
 CREATE TABLE tally (
-  kind TEXT NOT NULL, is_take INTEGER NOT NULL, task TEXT NOT NULL, operator TEXT, station TEXT,
-  domain TEXT NOT NULL, origin TEXT NOT NULL, success INTEGER, recovered INTEGER NOT NULL,
-  verdict TEXT, take_verdict TEXT,
-  num INTEGER NOT NULL DEFAULT 0, duration_ns INTEGER NOT NULL DEFAULT 0);
-CREATE INDEX tally_key ON tally({", ".join(_TALLIED)});
+  kind TEXT NOT NULL, is_take INTEGER NOT NULL, {_ATTRIBUTE_COLUMNS}, verdict TEXT,
+  take_verdict TEXT, num INTEGER NOT NULL DEFAULT 0, duration_ns INTEGER NOT NULL DEFAULT 0);
+CREATE INDEX tally_key ON tally({", ".join(_COUNTED)});
 CREATE TABLE fact (name TEXT PRIMARY KEY, value INTEGER NOT NULL) WITHOUT ROWID;
 CREATE INDEX lineage_source ON lineage(source, kind);
 CREATE INDEX result_id ON result(id);
@@ -118,7 +113,7 @@ CREATE TRIGGER item_gone AFTER DELETE ON item BEGIN
   UPDATE item SET is_dirty = 1
     WHERE row IN (SELECT row FROM result WHERE id = old.id) AND kind = old.kind;
   UPDATE grp SET is_stale = 1 WHERE number = old.grp;
-  {_tallied("old", "-")}
+  {_count("old", "-")}
   DELETE FROM body WHERE row = old.row;
   DELETE FROM result WHERE row = old.row;
   DELETE FROM lineage WHERE row = old.row;
@@ -127,11 +122,11 @@ END;
 CREATE TRIGGER item_judged AFTER UPDATE OF is_take, verdict, take_verdict ON item
   WHEN (old.is_take, old.verdict, old.take_verdict)
     IS NOT (new.is_take, new.verdict, new.take_verdict) BEGIN
-  {_tallied("old", "-")}
-  {_tallied("new", "+")}
+  {_count("old", "-")}
+  {_count("new", "+")}
 END;
 CREATE TRIGGER item_made AFTER INSERT ON item BEGIN
-  {_tallied("new", "+")}
+  {_count("new", "+")}
   UPDATE item SET is_dirty = 1
     WHERE row IN (SELECT row FROM lineage WHERE source = new.id AND kind = new.kind);
   UPDATE item SET is_dirty = 1

@@ -25,7 +25,7 @@ from typing import Final, NamedTuple, TypeVar
 
 import structlog
 
-from dextouch.episodes import COMMIT_FILE, KINDS, EpisodeStore, Kind, Stamps, disk_errors
+from dextouch.episodes import COMMIT_FILE, KINDS, EpisodeStore, GroupFingerprint, Kind, disk_errors
 from dextouch.errors import CorruptDataError, DexTouchError, NotFoundError, StorageError
 from services.episode_store.catalog_file import (
     CatalogFile,
@@ -64,12 +64,12 @@ Write = Callable[[sqlite3.Connection], None]
 
 
 class _Listing(NamedTuple):
-    """Items as they were found: what was known of some before that, all names, and stamps."""
+    """Items as they were found: what was known of some before that, all names, and fingerprints."""
 
     kind: Kind
-    before: Mapping[str, Stamps]
+    before: Mapping[str, GroupFingerprint]
     found: Mapping[str, int]
-    stamps: Mapping[str, Stamps]
+    fingerprints: Mapping[str, GroupFingerprint]
 
 
 class CatalogIndex:
@@ -86,10 +86,10 @@ class CatalogIndex:
         self._file = CatalogFile(store.root, tag)
         self._progress = progress or (lambda items, _what, _total: items)
         self._guard = threading.RLock()
-        # Of this connection: stamps of the rows, those of omitted items, and when it looked; a mark
-        # is forgotten where something is left to the next look.
-        self._known: dict[Kind, dict[str, Stamps]] = {kind: {} for kind in KINDS}
-        self._omitted: dict[Kind, dict[str, Stamps]] = {kind: {} for kind in KINDS}
+        # Of this connection: fingerprints of the rows and of omitted items, and when it looked; a
+        # mark is forgotten where something is left to the next look.
+        self._known: dict[Kind, dict[str, GroupFingerprint]] = {kind: {} for kind in KINDS}
+        self._omitted: dict[Kind, dict[str, GroupFingerprint]] = {kind: {} for kind in KINDS}
         self._is_checked: dict[Kind, bool] = dict.fromkeys(KINDS, False)
         self._marks: dict[Kind, int | None] = dict.fromkeys(KINDS, None)
         self._listed: dict[Kind, tuple[int, Mapping[str, int]]] = {kind: (0, {}) for kind in KINDS}
@@ -122,7 +122,7 @@ class CatalogIndex:
         known = self._run(lambda _: {kind: dict(self._known[kind]) for kind in KINDS})
         for kind in KINDS:
             found = self._store.folder_numbers(kind=kind)
-            listing = _Listing(kind, known[kind], found, self._store.stamps(found, kind=kind))
+            listing = _Listing(kind, known[kind], found, self._store.fingerprints(found, kind=kind))
             self._run(partial(self._apply, listing=listing, again=True))
             self._is_checked[kind] = True
 
@@ -133,8 +133,8 @@ class CatalogIndex:
             before = self._known[kind].get(item_id)
             if before is not None:
                 found = {item_id: before.folder}
-                stamps = self._store.stamps(found, kind=kind)
-                self._apply(connection, _Listing(kind, {item_id: before}, found, stamps))
+                current = self._store.fingerprints(found, kind=kind)
+                self._apply(connection, _Listing(kind, {item_id: before}, found, current))
 
         self._run(reread)
 
@@ -171,7 +171,7 @@ class CatalogIndex:
         raise AssertionError("unreachable")
 
     def _connection(self) -> sqlite3.Connection:
-        """A connection, with the stamps that are in its rows now."""
+        """A connection, with the fingerprints that are in its rows now."""
         connection, is_new = self._file.connection()
         (version,) = connection.execute("PRAGMA data_version").fetchone()
         if is_new:
@@ -182,7 +182,7 @@ class CatalogIndex:
                 rows = connection.execute(
                     "SELECT id, folder, content, remarks FROM item WHERE kind = ?", (kind,)
                 )
-                known = {name: Stamps(*stamps) for name, *stamps in rows}
+                known = {name: GroupFingerprint(*parts) for name, *parts in rows}
                 if self._known[kind].keys() - known.keys():
                     # An erasure removes rows of items that stay.
                     self._marks[kind] = None
@@ -213,10 +213,10 @@ class CatalogIndex:
             self._listed[kind] = mark, found
         if is_check:
             wanted = found
-        stamps = self._store.stamps(wanted, kind=kind)
+        current = self._store.fingerprints(wanted, kind=kind)
         names = known.keys() if is_check else (known.keys() - found.keys()) | wanted.keys()
         before = {name: known[name] for name in names if name in known}
-        is_done = self._apply(connection, _Listing(kind, before, found, stamps), again=is_check)
+        is_done = self._apply(connection, _Listing(kind, before, found, current), again=is_check)
         if is_check:
             self._is_checked[kind] = True
             if not self._is_local:
@@ -251,27 +251,27 @@ class CatalogIndex:
         `again` also tries those that could not be read at the last check. Returns whether nothing
         is left to the next look.
         """
-        kind, before, found, stamps = listing
+        kind, before, found, current = listing
         omitted = {} if again else self._omitted[kind]
         known = self._known[kind]
         self._omitted[kind] = {name: one for name, one in omitted.items() if name in found}
         # What another thread or process has changed since is left to the next look.
         gone = [
-            name for name, one in before.items() if name not in stamps and known.get(name) == one
+            name for name, one in before.items() if name not in current and known.get(name) == one
         ]
         changed = [
             name
-            for name, one in stamps.items()
+            for name, one in current.items()
             if known.get(name) == before.get(name) != one and omitted.get(name) != one
         ]
         many = len(changed) > BATCH
         names = iter(self._progress(changed, f"read {kind}s", len(changed)) if many else changed)
         is_done = True
         while some := list(islice(names, BATCH)):
-            found_now = {name: self._read(kind, name, stamps[name]) for name in some}
+            found_now = {name: self._read(kind, name, current[name]) for name in some}
             gone += [n for n, write in found_now.items() if write is _no_row and n in known]
             writes = {n: write for n, write in found_now.items() if write and write is not _no_row}
-            is_done &= self._write(connection, kind, {n: stamps[n] for n in writes}, writes)
+            is_done &= self._write(connection, kind, {n: current[n] for n in writes}, writes)
         if gone:
             with transaction(connection):
                 connection.executemany(
@@ -285,34 +285,34 @@ class CatalogIndex:
         self,
         connection: sqlite3.Connection,
         kind: Kind,
-        stamps: Mapping[str, Stamps],
+        current: Mapping[str, GroupFingerprint],
         writes: Mapping[str, Write],
     ) -> bool:
         """Write rows of items that are still as they were read; returns whether all were."""
         if not writes:
             return True
-        numbers = {name: one.folder for name, one in stamps.items()}
+        numbers = {name: one.folder for name, one in current.items()}
         with transaction(connection):
             # What was deleted since must not get a row, after its erasure from this file.
-            now = self._store.stamps(numbers, kind=kind) if self._is_local else stamps
-            done = {name: one for name, one in stamps.items() if now.get(name) == one}
+            now = self._store.fingerprints(numbers, kind=kind) if self._is_local else current
+            done = {name: one for name, one in current.items() if now.get(name) == one}
             for name in done:
                 writes[name](connection)
         self._known[kind] |= done
         return len(done) == len(writes)
 
-    def _read(self, kind: Kind, name: str, stamps: Stamps) -> Write | None:
+    def _read(self, kind: Kind, name: str, fingerprint: GroupFingerprint) -> Write | None:
         """What writes the row of an item; `_no_row`, or None for one that is left as it is."""
         before, store = self._known[kind].get(name), self._store
         try:
-            if before is None or before[:2] != stamps[:2]:
-                return partial(write_row, row=read_row(store, kind, name, stamps))
+            if before is None or before[:2] != fingerprint[:2]:
+                return partial(write_row, row=read_row(store, kind, name, fingerprint))
             review, clicks = read_remarks(store, kind, name)
         except NotFoundError:
             # Deleted while we were listing; one that comes back is read again.
             return _no_row
         except StorageError as error:
-            self._omitted[kind][name] = stamps
+            self._omitted[kind][name] = fingerprint
             problem = (kind, name, error.message)
             if problem not in self._reported:
                 self._reported.add(problem)
@@ -320,7 +320,7 @@ class CatalogIndex:
             # A disk or a limit of the system changes nothing of what was read before.
             return _no_row if isinstance(error, CorruptDataError) else None
         return partial(
-            write_remarks, name=(kind, name), stamps=stamps, review=review, clicks=clicks
+            write_remarks, name=(kind, name), fingerprint=fingerprint, review=review, clicks=clicks
         )
 
 

@@ -9,17 +9,18 @@ from typing import Any, Final
 import numpy as np
 import structlog
 
+from dextouch import schemas
 from dextouch.episodes import (
     EpisodeReader,
     EpisodeStore,
+    GroupFingerprint,
     Kind,
     RecordingReader,
-    Stamps,
     has_object_poses,
 )
 from dextouch.errors import CorruptDataError
-from dextouch.schemas import EpisodeClicks, EpisodeSummary, LineageEntry, RecordingSummary, Review
 from services.episode_store.filters import (
+    EQUALITY_FILTERS,
     NO_WEIGHT,
     WEIGHTS,
     item_name,
@@ -88,16 +89,18 @@ class ItemRow:
 
     item: Mapping[str, object]
     body: Mapping[str, object]
-    lineage: tuple[LineageEntry, ...]
+    lineage: tuple[schemas.LineageEntry, ...]
     quality: Mapping[str, float]
     results: tuple[str, ...]
 
 
-def read_row(store: EpisodeStore, kind: Kind, item_id: str, stamps: Stamps) -> ItemRow:
+def read_row(
+    store: EpisodeStore, kind: Kind, item_id: str, fingerprint: GroupFingerprint
+) -> ItemRow:
     """Read an item; raises as `EpisodeStore.open`."""
     reader = store.open_item(kind, item_id)
     about = reader.attributes
-    summary: EpisodeSummary | RecordingSummary
+    summary: schemas.EpisodeSummary | schemas.RecordingSummary
     if isinstance(reader, EpisodeReader):
         summary, at = _episode(reader), reader.attributes.created_at
     else:
@@ -107,21 +110,18 @@ def read_row(store: EpisodeStore, kind: Kind, item_id: str, stamps: Stamps) -> I
     is_clickable = isinstance(reader, EpisodeReader) and _is_clickable(reader)
     review, clicks = read_remarks(store, kind, item_id)
     parts = (item_id, about.task, about.instruction, about.operator, about.station, about.trace_id)
-    names = (
-        "kind", "id", "task", "operator", "station", "domain", "origin", "success", "recovered",
-        "trace_id", "complete", "duration_s",
-    )  # fmt: skip
+    names = ("kind", "id", *EQUALITY_FILTERS, "complete", "duration_s")
     columns: dict[str, object] = {name: getattr(item, name) for name in names}
-    columns |= stamps._asdict() | {
+    columns |= fingerprint._asdict() | {
         "name": item_name(item_id, kind),
         "sha256": reader.content_sha256,
         "at_us": None if at is None else microseconds(at),
         "at_key": time_key(at),
         "duration_key": number_key(item.duration_s),
         "size": summary.num_steps
-        if isinstance(summary, EpisodeSummary)
+        if isinstance(summary, schemas.EpisodeSummary)
         else sum(summary.num_samples.values()),
-        "num_bytes": summary.num_bytes if isinstance(summary, RecordingSummary) else None,
+        "num_bytes": summary.num_bytes if isinstance(summary, schemas.RecordingSummary) else None,
         "beyond_limit": bool(item.findings),
         "in_doubt": bool(item.time_doubts),
         "is_clickable": is_clickable,
@@ -143,7 +143,7 @@ def read_row(store: EpisodeStore, kind: Kind, item_id: str, stamps: Stamps) -> I
 
 def read_remarks(
     store: EpisodeStore, kind: Kind, item_id: str
-) -> tuple[Review | None, EpisodeClicks | None]:
+) -> tuple[schemas.Review | None, schemas.EpisodeClicks | None]:
     """Review of an item and clicks of an episode; None, with a line of the log, if damaged."""
     review, clicks = None, None
     for name in ("review", "clicks")[: 1 + (kind == "episode")]:
@@ -157,9 +157,9 @@ def read_remarks(
     return review, clicks
 
 
-def _episode(reader: EpisodeReader) -> EpisodeSummary:
+def _episode(reader: EpisodeReader) -> schemas.EpisodeSummary:
     attributes, num_steps = reader.attributes, reader.num_steps
-    return EpisodeSummary(
+    return schemas.EpisodeSummary(
         episode_id=reader.item_id,
         origin=attributes.origin,
         num_steps=num_steps,
@@ -170,9 +170,9 @@ def _episode(reader: EpisodeReader) -> EpisodeSummary:
     )
 
 
-def _recording(store: EpisodeStore, reader: RecordingReader) -> RecordingSummary:
+def _recording(store: EpisodeStore, reader: RecordingReader) -> schemas.RecordingSummary:
     attributes = reader.attributes
-    return RecordingSummary(
+    return schemas.RecordingSummary(
         recording_id=reader.item_id,
         consent=attributes.consent,
         num_samples={name: reader.num_samples(name) for name in reader.streams},
@@ -193,7 +193,7 @@ def _is_clickable(reader: EpisodeReader) -> bool:
 
 def _shared_fields(reader: EpisodeReader | RecordingReader) -> dict[str, Any]:
     """The fields that the summaries of both kinds have under one name."""
-    names = ("task", "domain", "station", "operator", "success", "recovered")
+    names = schemas.EpisodeSummary.model_fields.keys() & schemas.SHARED_ATTRIBUTES
     fields = {name: getattr(reader.attributes, name) for name in names}
     return fields | {"content_sha256": reader.content_sha256}
 
@@ -244,9 +244,9 @@ def write_remarks(
     connection: sqlite3.Connection,
     *,
     name: tuple[Kind, str],
-    stamps: Stamps,
-    review: Review | None,
-    clicks: EpisodeClicks | None,
+    fingerprint: GroupFingerprint,
+    review: schemas.Review | None,
+    clicks: schemas.EpisodeClicks | None,
 ) -> None:
     """Change what people say of an item, by kind and id; `relink` must follow."""
     found = connection.execute("SELECT row FROM item WHERE kind = ? AND id = ?", name).fetchone()
@@ -255,7 +255,7 @@ def write_remarks(
     connection.execute(
         "UPDATE item SET folder = ?, content = ?, remarks = ?, own_verdict = ?, "
         "earlier_verdict = ?, is_superseded = ?, is_dirty = 1 WHERE row = ?",
-        (*stamps, *_verdicts(review).values(), *found),
+        (*fingerprint, *_verdicts(review).values(), *found),
     )
     connection.execute(
         "UPDATE body SET review = ?, clicks = ? WHERE row = ?",
@@ -265,7 +265,7 @@ def write_remarks(
     _insert_results(connection, found[0], () if review is None else review.superseded_by)
 
 
-def _verdicts(review: Review | None) -> dict[str, object]:
+def _verdicts(review: schemas.Review | None) -> dict[str, object]:
     earlier = None if review is None else review.earlier
     return {
         "own_verdict": None if review is None else review.verdict,
@@ -280,7 +280,7 @@ def _insert_results(connection: sqlite3.Connection, row: int, results: tuple[str
     )
 
 
-def _json(remark: Review | EpisodeClicks | None) -> str | None:
+def _json(remark: schemas.Review | schemas.EpisodeClicks | None) -> str | None:
     return None if remark is None else remark.model_dump_json()
 
 

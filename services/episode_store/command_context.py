@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from dextouch.data_folder import is_system_file
+from dextouch.data_folder import is_bucket_url, is_system_file
 from dextouch.episodes import KINDS, EpisodeStore, Kind, check_id, local_folder
 from dextouch.errors import InvalidInputError, NotFoundError
 
@@ -63,7 +63,7 @@ class Context:
     @property
     def root(self) -> Path | None:
         """The store's folder; None for one in a bucket."""
-        return None if self.url.startswith("s3://") else local_folder(self.url)
+        return None if is_bucket_url(self.url) else local_folder(self.url)
 
     def need_local_root(self) -> Path:
         """The store's folder. Raises InvalidInputError: a store in a bucket."""

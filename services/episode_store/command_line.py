@@ -20,9 +20,9 @@ from dextouch.episodes import (
     Kind,
     LocalGroup,
     TrashKind,
-    care,
     clicked_poses,
     has_object_poses,
+    maintenance,
     shard_path,
     stream_arrays,
     touched_objects,
@@ -159,7 +159,7 @@ def show(context: Context) -> Outcome:
     store = context.store
     reader = store.open_item(kind, item_id)
     files = store.files(item_id, kind=kind)
-    contents = care.open_contents(files, kind)
+    contents = maintenance.open_contents(files, kind)
     streams, total_per_hour = {}, 0
     rows: list[tuple[str, ...]] = [
         ("stream", "Hz", "samples", "gaps", "size", "per hour", "codec", "encoder")
@@ -208,7 +208,7 @@ def show(context: Context) -> Outcome:
 def verify(context: Context) -> Outcome:
     """Verify items completely and list all damage."""
     items, root = context.items(), context.root
-    reports: list[care.ItemReport] = []
+    reports: list[maintenance.ItemReport] = []
     for kind, item_id in progress(items, "verify", len(items)):
         try:
             # Not through the store, which ignores groups without a commit record.
@@ -217,15 +217,14 @@ def verify(context: Context) -> Outcome:
                 if root is None
                 else LocalGroup(root / f"{kind}s" / item_id)
             )
-            reports.append(care.inspect_group(files, kind))
+            reports.append(maintenance.inspect_group(files, kind))
         except NotFoundError:
             say(f"{item_id}  deleted meanwhile  {kind}")
     if not context.options.ids:
-        reports += [] if root is None else care.inspect_unfinished(root)
-        reports += [
-            care.ItemReport("catalog", "catalog", findings=(care.Finding(problem, foreign=True),))
-            for problem in Catalog(context.store).index.verify()
-        ]
+        reports += [] if root is None else maintenance.inspect_unfinished(root)
+        for problem in Catalog(context.store).index.verify():
+            finding = maintenance.Finding(problem, foreign=True)
+            reports.append(maintenance.ItemReport("catalog", "catalog", findings=(finding,)))
     for report in reports:
         _say_report(report)
     damaged = {r.item_id: "; ".join(f.message for f in r.findings) for r in reports if r.damaged}
@@ -237,7 +236,7 @@ def verify(context: Context) -> Outcome:
     return result, EXIT_DAMAGED if damaged else 0
 
 
-def _say_report(report: care.ItemReport) -> None:
+def _say_report(report: maintenance.ItemReport) -> None:
     size = f"{report.num_arrays} arrays, {report.num_bytes} bytes"
     if report.damaged:
         for finding in report.findings:
@@ -346,22 +345,22 @@ def _delete_all_of(context: Context) -> Outcome:
         )
     # Derived data of an operator is always deleted; that of a recording on request.
     derived = options.derived or options.operator is not None
-    request = care.DeletionRequest(
+    request = maintenance.DeletionRequest(
         operator=options.operator, recording=options.recording, derived=derived
     )
     name = options.operator or options.recording
-    victims = care.plan_deletion(root, request)
+    victims = maintenance.plan_deletion(root, request)
     for victim in victims:
         say(f"{victim.place}/{victim.folder}  {victim.reason}")
     gone = {(victim.place, victim.folder) for victim in victims}
-    for facts in care.reviews_by(root, request):
+    for facts in maintenance.reviews_by(root, request):
         if (facts.place, facts.folder.name) not in gone:
             say(f"{facts.place}/{facts.folder.name}  review or notes: lose their author's name")
     if not options.yes and _answer(f"Type {name} to delete all of this permanently: ") != name:
         raise InvalidInputError("delete: not confirmed; nothing was removed")
     path = options.receipt or Path(f"deletion-{datetime.now(UTC):%Y%m%dT%H%M%SZ}.json")
     unsent = options.unsent and options.operator is not None
-    receipt = care.delete_for_good(
+    receipt = maintenance.delete_for_good(
         root, request, path, checkpoints=options.checkpoints, unsent=unsent
     )
     for reference in receipt.remaining:
@@ -389,7 +388,7 @@ def deletions(context: Context) -> Outcome:
     """List permanent deletions and what stations have yet to remove."""
     from services.episode_store.deletions import deletion_statuses
 
-    options, records = context.options, care.DeletionRecords(context.need_local_root())
+    options, records = context.options, maintenance.DeletionRecords(context.need_local_root())
     if options.readmit is not None:
         if not records.readmit(options.readmit):
             raise NotFoundError(f"deletions: no deleted operator {options.readmit!r}")
@@ -450,16 +449,16 @@ def repair(context: Context) -> Outcome:
     """Repair damaged items from a copy, and salvage the rest."""
     root, options = context.need_local_root(), context.options
     copies = EpisodeStore(options.source) if options.source else None
-    reports = [] if options.ids else care.repair_uploads(root)
-    for kind, item_id in context.items():
-        reports.append(care.repair_group(root, kind, item_id, copy=_copy(copies, kind, item_id)))
+    reports = [] if options.ids else maintenance.repair_uploads(root)
+    for kind, name in context.items():
+        reports.append(maintenance.repair_group(root, kind, name, copy=_copy(copies, kind, name)))
     for report in reports:
         say(f"{report.item_id}  {report.action}" + f"  as {report.new_id}" * bool(report.new_id))
         for name, count in report.lost.items():
             say(f"  {name}: {count} samples lost")
         for text in report.notes:
             say(f"  {text}")
-    left = any(report.action == care.LEFT for report in reports)
+    left = any(report.action == maintenance.LEFT for report in reports)
     return {"reports": [asdict(r) for r in reports]}, EXIT_DAMAGED if left else 0
 
 

@@ -6,7 +6,7 @@ from typing import Annotated, Final
 import structlog
 from fastapi import APIRouter, Depends
 
-from dextouch.episodes.care import DeletionRecords, TakeFacts, take_start
+from dextouch.episodes.maintenance import DeletionRecords, TakeFacts, take_start
 from dextouch.errors import ConflictError
 from dextouch.schemas import (
     OPERATOR_DELETED,

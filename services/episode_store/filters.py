@@ -14,9 +14,12 @@ from dextouch.schemas import Domain, Origin, Verdict
 Outcome = Literal["success", "failure", "not_judged"]
 SortKey = Literal["id", "time", "duration", "task", "operator", "station", "findings"]
 ItemsKind = Literal["take", "recording", "episode"]
-_COMPARED = (
-    "task", "operator", "station", "domain", "success", "recovered", "origin", "trace_id",
-)  # fmt: skip
+# Attributes that rows are counted by, with their columns in the tables `item` and `tally`.
+COUNTED_ATTRIBUTES: Final = {
+    "task": "TEXT NOT NULL", "operator": "TEXT", "station": "TEXT", "domain": "TEXT NOT NULL",
+    "origin": "TEXT NOT NULL", "success": "INTEGER", "recovered": "INTEGER NOT NULL",
+}  # fmt: skip
+EQUALITY_FILTERS: Final = (*COUNTED_ATTRIBUTES, "trace_id")
 # Order of items by their findings, where those without a score are among the outliers.
 WEIGHTS: Final = {
     "incomplete": 20.0,
@@ -40,12 +43,12 @@ _SUCCESS: dict[Outcome, bool | None] = {"success": True, "failure": False, "not_
 class Condition:
     """An SQL condition on a row `i` of the catalog with its parameters.
 
-    In the list of takes (`of_takes`) a recording's last episode is the row `a`. With `is_tallied`
+    In the list of takes (`of_takes`) a recording's last episode is the row `a`. With `is_counted`
     its terms have only columns of `tally`; few rows match one that `is_rare`.
     """
 
     of_takes: bool = False
-    is_tallied: bool = True
+    is_counted: bool = True
     is_rare: bool = False
     tables: str = "item i"
     terms: list[str] = field(default_factory=list)
@@ -55,9 +58,9 @@ class Condition:
         """Make the last episode of a take known to the terms."""
         self.tables = "item i LEFT JOIN item a ON a.row = i.aligned"
 
-    def add(self, term: str, *values: object, is_tallied: bool = False) -> None:
+    def add(self, term: str, *values: object, is_counted: bool = False) -> None:
         """A further term that must hold."""
-        self.is_tallied &= is_tallied
+        self.is_counted &= is_counted
         self.terms.append(term)
         self.values += values
 
@@ -107,11 +110,11 @@ class CatalogFilter(FrozenModel):
 
     def restrict(self, to: Condition) -> None:
         """Add what must hold of a matching row."""
-        for name in _COMPARED:
+        for name in EQUALITY_FILTERS:
             if (value := getattr(self, name, None)) is not None:
-                to.add(f"i.{name} = ?", value, is_tallied=name != "trace_id")
+                to.add(f"i.{name} = ?", value, is_counted=name in COUNTED_ATTRIBUTES)
         if self.outcome is not None:
-            to.add("i.success IS ?", _SUCCESS[self.outcome], is_tallied=True)
+            to.add("i.success IS ?", _SUCCESS[self.outcome], is_counted=True)
         if self.text:
             # `text` of a take is that of its recording and of its episode.
             column = "i.text"
@@ -163,7 +166,7 @@ class ItemFilter(CatalogFilter):
         prefix = "take_" if to.of_takes else ""
         if self.review is not None:
             verdict = None if self.review == "not_reviewed" else self.review
-            to.add(f"i.{prefix}verdict IS ?", verdict, is_tallied=True)
+            to.add(f"i.{prefix}verdict IS ?", verdict, is_counted=True)
         if self.flagged is not None:
             to.add(f"i.{prefix}weight {'>' if self.flagged else '='} ?", NO_WEIGHT)
         if self.id:

@@ -13,7 +13,7 @@ from weakref import WeakValueDictionary
 import structlog
 
 from dextouch.episodes import EpisodeStore, check_id, disk_errors
-from dextouch.episodes.care import UPLOADS, DeletionRecords
+from dextouch.episodes.maintenance import UPLOADS, DeletionRecords
 from dextouch.episodes.spool import SpoolReader, SpoolWriter, read_attributes
 from dextouch.errors import (
     ConflictError,

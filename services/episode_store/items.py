@@ -22,6 +22,7 @@ from pydantic import Field
 
 from dextouch.episodes import EpisodeReader, RecordingReader
 from dextouch.schemas import (
+    SHARED_ATTRIBUTES,
     CatalogItem,
     ClockReport,
     EpisodeAttributes,
@@ -36,10 +37,6 @@ from services.episode_store.filters import EpisodeFilter
 
 # Median and scale of each figure among the items of a group.
 Spread = Float64[np.ndarray, "2 figures"]
-_SHARED: Final = (
-    "task", "instruction", "domain", "station", "operator", "success", "recovered", "trace_id",
-    "complete", "incomplete_cause",
-)  # fmt: skip
 HoursField = Literal["task", "operator", "station", "day"]
 # MAD of a normal distribution with standard deviation 1 (Iglewicz and Hoaglin, section 3.3).
 MAD_OF_SIGMA: Final = 0.6745
@@ -53,7 +50,7 @@ def item_of(
 ) -> CatalogItem:
     """The row of an item on its own."""
     about = reader.attributes
-    fields: dict[str, Any] = {name: getattr(about, name) for name in _SHARED}
+    fields: dict[str, Any] = {name: getattr(about, name) for name in SHARED_ATTRIBUTES}
     if isinstance(summary, EpisodeSummary):
         fields |= {"kind": "episode", "origin": summary.origin, "at": summary.created_at}
         num_steps = summary.num_steps

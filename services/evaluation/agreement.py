@@ -5,7 +5,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
@@ -25,14 +25,23 @@ from services.evaluation.statistics import (
     shortest_interval,
 )
 
-FIGURES: Final[Mapping[str, Callable[..., float]]] = {
-    "pearson": policy.pearson,
-    "spearman": policy.spearman,
-    "kendall": policy.kendall,
-    "mmrv": partial(policy.mmrv, ties="simpler"),
-    "mmrv_paper": partial(policy.mmrv, ties="paper"),
-    "bias": policy.bias,
-    "mean_absolute_error": policy.mean_absolute_error,
+
+class Measure(NamedTuple):
+    """A measure of agreement: its name in reports, and its function of `real` and `imagined`."""
+
+    title: str
+    compute: Callable[..., float]
+
+
+# By their keys in report.json; reports and tables derive from this list.
+FIGURES: Final[Mapping[str, Measure]] = {
+    "pearson": Measure("Pearson", policy.pearson),
+    "spearman": Measure("Spearman", policy.spearman),
+    "kendall": Measure("Kendall", policy.kendall),
+    "mmrv": Measure("MMRV, ties counted", partial(policy.mmrv, ties="simpler")),
+    "mmrv_paper": Measure("MMRV, paper's rule", partial(policy.mmrv, ties="paper")),
+    "bias": Measure("mean of imagined minus real", policy.bias),
+    "mean_absolute_error": Measure("mean absolute error", policy.mean_absolute_error),
 }
 CORRELATIONS: Final = ("pearson", "spearman", "kendall")
 # Up to this many assignments of policies are enumerated; otherwise this many are drawn.
@@ -137,7 +146,7 @@ def _value(name: str, real: np.ndarray, imagined: np.ndarray) -> float:
     """A figure over all scores [tasks, policies] at once; NaN where it is undefined."""
     if name in CORRELATIONS and real.shape[1] < policy.MIN_POLICIES:
         return math.nan
-    return float(FIGURES[name](real=real.ravel(), imagined=imagined.ravel()))
+    return float(FIGURES[name].compute(real=real.ravel(), imagined=imagined.ravel()))
 
 
 def _figures(real: np.ndarray, imagined: np.ndarray, draws: Draws) -> dict[str, Figure]:

@@ -33,7 +33,7 @@ BUNDLED: Final[Mapping[str, Bundled]] = {
     "behaviour-cloning": Bundled(f"{__name__}:trained_policy", DEFAULT_POLICY),
     # Knows only the tasks stand_bottle and open_drawer.
     "colour-servo": Bundled(f"{_POLICIES}.colour_servo:ColourServo"),
-    "hold": Bundled(f"{_POLICIES}.replay:HoldPolicy"),
+    "hold": Bundled(f"{_POLICIES}.open_loop:HoldPolicy"),
 }
 if TYPE_CHECKING:
     from dextouch.clients import Policy

@@ -38,9 +38,9 @@ from services.evaluation.matched_starts import (
     refuse_training_starts,
     rollout_failure,
 )
-from services.evaluation.policies.outside import action_chunk, ask
+from services.evaluation.policies.user_policies import action_chunk, ask
 from services.evaluation.progress import Progress
-from services.evaluation.rating.marks import Rubric, read_rubrics
+from services.evaluation.rating.rubrics import Rubric, read_rubrics
 from services.evaluation.reporting.pictures import PredictionPicture
 from services.evaluation.scores import REAL, ClosedLoopReport, Outcome, RolloutFailure, RolloutScore
 from services.evaluation.success_classifier import SuccessClassifier

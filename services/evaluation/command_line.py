@@ -18,8 +18,9 @@ from services.evaluation.closed_loop import EvaluationPlan, ResultLog, evaluate,
 from services.evaluation.endings import EndingEpisode, read_ending_episodes
 from services.evaluation.matched_starts import WorldAddress
 from services.evaluation.policies.cloning_training import read_cloning_episodes, train_cloned_policy
-from services.evaluation.policies.outside import load_policies
-from services.evaluation.policies.replay import ReplayPolicy
+from services.evaluation.policies.open_loop import ReplayPolicy
+from services.evaluation.policies.user_policies import load_policies
+from services.evaluation.rendering import rendered
 from services.evaluation.reporting import write_report
 from services.evaluation.reporting.pictures import ReportPictures
 from services.evaluation.reporting.sections import failure_rows, undecided_note
@@ -37,7 +38,6 @@ from services.evaluation.success_classifier_training import (
     calibrate_success_classifier,
     train_success_classifier,
 )
-from services.evaluation.templates import rendered
 from services.evaluation.trained_networks import Checkpoint, load_checkpoint, save_checkpoint
 
 EXIT_FAILED = 1
@@ -90,13 +90,13 @@ def run_train_judge(arguments: list[str]) -> int:
             ),
             [*read(settings.episodes), *read(settings.development)],
             settings.training,
-            command=command_line("probe", arguments),
+            command=command_line("judge", arguments),
         )
         return keep(calibrated, settings.output, settings.json_path)
     checkpoint = train_success_classifier(
         read(settings.episodes),
         settings.training,
-        command=command_line("probe", arguments),
+        command=command_line("judge", arguments),
         development=read(settings.development),
         held_out=read(settings.held_out),
         jobs=settings.jobs,

@@ -33,12 +33,12 @@ from services.evaluation.matched_starts import (
     refuse_training_starts,
     start_digest,
 )
-from services.evaluation.policies.replay import ReplayPolicy
+from services.evaluation.policies.open_loop import ReplayPolicy
 from services.evaluation.progress import Progress
+from services.evaluation.rendering import rendered
 from services.evaluation.scores import ClosedLoopReport, Outcome, RolloutFailure, RolloutScore
 from services.evaluation.statistics import area_under_roc, central_interval
 from services.evaluation.success_classifier import SuccessClassifier
-from services.evaluation.templates import rendered
 from services.networks.training_settings import USUAL_IMAGE_PX
 
 IMAGINED: Final = "imagined"

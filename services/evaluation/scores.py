@@ -18,8 +18,8 @@ from services.evaluation.agreement import (
     pooled_agreement,
     task_agreement,
 )
+from services.evaluation.rendering import UNDEFINED, rendered
 from services.evaluation.statistics import MatchedScores, known_mean, wilson_interval
-from services.evaluation.templates import UNDEFINED, rendered
 
 # Endings that should be decided where classifier and world are good enough.
 LEAST_DECIDED: Final = 0.60
@@ -42,8 +42,8 @@ class RolloutScore:
 
     `success` is reported by the real world and decided by the probe elsewhere; `probability` is
     that of the probe's verdict, in the real world too, so that the probe itself can be evaluated.
-    `cannot_tell` is the reason why the probe abstains on an imagined rollout; `success` is then the
-    more likely outcome, which counts in no rate. `repeat` numbers imagined rollouts that differ by
+    `cannot_tell` is the reason why an imagined rollout is undecided; `success` is then the more
+    likely outcome, which counts in no rate. `repeat` numbers imagined rollouts that differ by
     their noise alone. `world_probability` is the world's own estimate of success, if it has one.
     `rubric_score` is the share of the rubric's points, by the milestones that the real world
     reports, or in imagined worlds the mean over what the probe deems possible; None where the task
@@ -218,8 +218,9 @@ class ClosedLoopReport:
             known = np.isfinite(means["real"]) & np.isfinite(means["imagined"])
             if num_policies := int(known.sum()):
                 pair = {side: values[known] for side, values in means.items()}
-                figures = {n: defined(FIGURES[n](**pair), num_policies) for n in _RUBRIC_FIGURES}
-                found[task] = {**figures, "num_policies": num_policies}
+                figures = {name: FIGURES[name].compute(**pair) for name in _RUBRIC_FIGURES}
+                found[task] = {name: defined(one, num_policies) for name, one in figures.items()}
+                found[task]["num_policies"] = num_policies
         return found
 
     def _rubric(self, world: str, task: str, policy: str) -> float:
@@ -254,7 +255,8 @@ class ClosedLoopReport:
             counts = {"num_policies": 0, "num_starts": 0, "rates": {}, "not_comparable": vague}
             return undefined | counts, None
         pair = {"real": real.mean(axis=1), "imagined": known_mean(imagined, axis=1)}
-        found: dict[str, Any] = {n: defined(f(**pair), len(real)) for n, f in FIGURES.items()}
+        figures = {name: measure.compute(**pair) for name, measure in FIGURES.items()}
+        found: dict[str, Any] = {n: defined(one, len(real)) for n, one in figures.items()}
         joined = None
         if min(real.shape) >= 2:
             generator = np.random.default_rng(_SEED)

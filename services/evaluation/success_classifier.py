@@ -264,8 +264,8 @@ class Verdict:
     """Decision of the probe about one ending.
 
     `probability` is the probe's, joined with the world's own estimate `world_probability` where an
-    imagined ending has one. `likely_success` is the more probable outcome, also where the probe
-    abstains; `reason` says why it does. `milestones` are the probabilities that each was reached by
+    imagined ending has one. `likely_success` is the more probable outcome, also where
+    nothing is decided, for `reason`. `milestones` are the probabilities that each was reached by
     the end, for those that the probe can classify; none is below that of success, which needs all.
     """
 

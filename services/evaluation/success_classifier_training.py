@@ -14,7 +14,7 @@ from torch.nn import functional
 from dextouch.episodes import data_hash, split_by_scene
 from dextouch.errors import InvalidInputError
 from dextouch.jobs import worker_pool
-from services.evaluation.calibration import (
+from services.evaluation.classifier_calibration import (
     classifiable_milestones,
     fit_calibrations,
     fit_combinations,

@@ -28,6 +28,7 @@ from services.episode_store.settings import EpisodeStoreSettings
 from services.evaluation.command_line import print_scores
 from services.evaluation.prediction import ALL_TASKS, all_metrics, described, measure_prediction
 from services.evaluation.prediction_scenes import read_rollout
+from services.evaluation.rendering import figure
 from services.evaluation.reporting import write_report
 from services.evaluation.reporting.pictures import (
     PredictionPicture,
@@ -36,7 +37,6 @@ from services.evaluation.reporting.pictures import (
     episode_picture,
 )
 from services.evaluation.reporting.sections import comparison_bars, error_rows
-from services.evaluation.templates import figure
 from services.pipelines import demo_scoring as scoring
 from services.pipelines import demo_takes as recording
 from services.pipelines.parsers import FIRST_HELD_OUT_SEED, TASKS, DemoPlan, demo_plan

@@ -12,7 +12,7 @@ import numpy as np
 
 from dextouch.clients import EpisodeStoreClient, HttpLink
 from dextouch.episodes import EpisodeReader, EpisodeStore
-from dextouch.episodes.care import UPLOADS
+from dextouch.episodes.maintenance import UPLOADS
 from dextouch.episodes.spool import SpoolReader
 from dextouch.errors import ConflictError, InvalidInputError, UnavailableError
 from dextouch.jobs import Workers, results_of, run_jobs

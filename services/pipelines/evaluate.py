@@ -11,11 +11,10 @@ from dextouch.command_line import write_result
 from dextouch.episodes import EpisodeReader, EpisodeStore, needs, select_episodes
 from dextouch.errors import UnknownNameError
 from dextouch.serving import configure_logging
-from services.evaluation.bundled_policies import trained_policy, training_starts_of
+from services.evaluation.bundled_policies import bundled_policy, trained_policy, training_starts_of
 from services.evaluation.matched_starts import WorldAddress
 from services.evaluation.perceptual_networks import Metric
-from services.evaluation.policies.outside import load_policies
-from services.evaluation.policies.replay import HoldPolicy
+from services.evaluation.policies.user_policies import load_policies
 from services.evaluation.prediction import (
     ALL_TASKS,
     GEOMETRY,
@@ -153,10 +152,9 @@ def recorded_main(arguments: Sequence[str]) -> int:
 
 
 def _policies(options: argparse.Namespace) -> dict[str, Policy]:
-    held = ["hold"] if options.hold else []
-    others = [REPLAY, *(name for name, _ in options.cloned), *held]
+    others = [REPLAY, *(name for name, _ in options.cloned), *dict.fromkeys(options.builtin)]
     policies = load_policies(
         options.policy, options.policy_arguments, others, other_option="--cloned NAME=CHECKPOINT"
     )
     policies |= {name: trained_policy(path) for name, path in options.cloned}
-    return policies | {name: HoldPolicy() for name in held}
+    return policies | {name: bundled_policy(name) for name in options.builtin}

@@ -35,7 +35,7 @@ from services.world_model.checkpoints import (
     read_state_checkpoint,
 )
 from services.world_model.state_world import StateWorld
-from services.world_model.training.dataset import read_episode
+from services.world_model.training.joint_dataset import read_episode
 from services.world_model.world import open_world
 
 WORLD = "world_model"

@@ -11,10 +11,12 @@ from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
+from dextouch.bridges.formats import FORMATS
 from dextouch.command_line import RAY_HELP, CommandParser, add_json, add_workers, positive
 from dextouch.data_folder import default_store
 from dextouch.episodes import SPLITS
 from dextouch.errors import InvalidInputError
+from services.evaluation.bundled_policies import BUNDLED
 from services.evaluation.prediction_names import BASELINES, DEFAULT_BASELINES, METRIC_NAMES
 from services.twin.names import (
     DEFAULT_MIX,
@@ -26,21 +28,6 @@ from services.twin.names import (
 )
 from services.world_model.settings import default_checkpoint
 
-# Formats with one file per episode or recording, and those with all episodes together.
-SINGLE_FORMATS, JOINT_FORMATS = ("mcap", "rrd"), ("umi", "lerobot")
-# Options of `dextouch export` and `dextouch import` that other formats would ignore.
-_FORMATS_OF = {
-    "append": ("lerobot",),
-    "fps": ("lerobot",),
-    "jpeg_quality": ("mcap",),
-    "k_head": ("lerobot",),
-    "layout": ("mcap",),
-    "license": ("lerobot",),
-    "repo_id": ("lerobot",),
-    "timeline": ("rrd",),
-    "touch_images": ("mcap",),
-    "touch_samples": ("lerobot",),
-}
 # Descriptions and examples by command.
 _WORDS = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 TASKS = ("stand_bottle", "stack_bowls")
@@ -105,6 +92,21 @@ def _parsed(text: str, form: Any, expected: str) -> Any:  # noqa: ANN401 - of th
         return TypeAdapter(form).validate_json(text)
     except ValidationError as error:
         raise argparse.ArgumentTypeError(f"got {text!r}, expected {expected}") from error
+
+
+# Options that choose items, as on the dashboard's list.
+EXPORT_FILTERS: dict[str, dict[str, Any]] = {
+    "text": {"metavar": "TEXT", "help": "in id, task, instruction, operator, station or trace"},
+    "task": {"metavar": "TASK", "help": "of this task"},
+    "operator": {"metavar": "P", "help": "of this operator"},
+    "station": {"metavar": "NAME", "help": "of this station"},
+    "domain": {"choices": ("human", "robot"), "help": "of this domain"},
+    "outcome": {"choices": ("success", "failure", "not_judged"), "help": "with this outcome"},
+    "origin": {"choices": ("recorded", "twin", "imagined"), "help": "of this origin"},
+    "review": {"choices": ("accepted", "rejected", "not_reviewed"), "help": "with this review"},
+    "after": {"type": _moment, "metavar": "DAY", "help": "recorded on this day or later"},
+    "before": {"type": _moment, "metavar": "DAY", "help": "recorded before this day"},
+}
 
 
 def training_data_parser() -> argparse.ArgumentParser:
@@ -229,7 +231,8 @@ def recorded_parser() -> argparse.ArgumentParser:
     add("--policy-arguments", type=_keywords_by_name, default={}, metavar="JSON", help=keywords)
     cloned = "a policy of `dextouch train policy`, NAME=CHECKPOINT; repeat for more"
     add("--cloned", action="append", type=_named_path, default=[], metavar="POLICY", help=cloned)
-    add("--hold", action="store_true", help="also score a policy that holds still")
+    add("--builtin", action="append", choices=BUNDLED, default=[], help="built-in; repeatable")
+    add("--hold", action="append_const", dest="builtin", const="hold", help="--builtin hold")
     add_json(parser)
     return parser
 
@@ -279,26 +282,16 @@ def _bridge_parser(command: str) -> argparse.ArgumentParser:
 def _add_filters(parser: argparse.ArgumentParser) -> None:
     about = "only items that match all of them; a DAY may be a time, too"
     add = parser.add_argument_group("filters", about).add_argument
-    add("--text", metavar="TEXT", help="in id, task, instruction, operator, station or trace")
-    add("--task", metavar="TASK", help="of this task")
-    add("--operator", metavar="P", help="of this operator")
-    add("--station", metavar="NAME", help="of this station")
-    add("--domain", choices=("human", "robot"), help="of this domain")
-    add("--outcome", choices=("success", "failure", "not_judged"), help="with this outcome")
-    add("--origin", choices=("recorded", "twin", "imagined"), help="of this origin")
-    reviews = ("accepted", "rejected", "not_reviewed")
-    add("--review", choices=reviews, help="with this review")
-    add("--after", type=_moment, metavar="DAY", help="recorded on this day or later")
-    add("--before", type=_moment, metavar="DAY", help="recorded before this day")
+    for name, words in EXPORT_FILTERS.items():
+        add(f"--{name}", **words)
 
 
 def export_parser() -> argparse.ArgumentParser:
     """Parser of `dextouch export`."""
     parser = _bridge_parser("export")
     add = parser.add_argument
-    forms = sorted([*SINGLE_FORMATS, *JOINT_FORMATS])
     add("ids", nargs="*", metavar="ID", help="default: all that match the filters")
-    add("--format", required=True, choices=forms, help="output format")
+    add("--format", required=True, choices=tuple(FORMATS), help="output format")
     to = "file; mcap and rrd: or a folder"
     add("--to", required=True, type=Path, metavar="PATH", help=to)
     kinds = ("episode", "recording")
@@ -331,11 +324,11 @@ def check_format_options(
     parser: argparse.ArgumentParser, options: argparse.Namespace, form: str
 ) -> None:
     """Raise InvalidInputError for an option that a format of the parser's command has no use of."""
-    is_import = "path" in vars(options)
-    for name, forms in _FORMATS_OF.items():
-        used = (*forms, "rrd") if is_import and name == "layout" else forms
-        given = getattr(options, name, None)
-        if name in vars(options) and given != parser.get_default(name) and form not in used:
+    column = "import_options" if "path" in vars(options) else "export_options"
+    names_of = {one: getattr(known, column) or () for one, known in FORMATS.items()}
+    for name in sorted({name for names in names_of.values() for name in names}):
+        used = [one for one, names in names_of.items() if name in names]
+        if getattr(options, name) != parser.get_default(name) and form not in used:
             flag = "--" + name.replace("_", "-")
             flag = "--no-touch-images" if name == "touch_images" else flag
             raise InvalidInputError(f"{flag} is for format {' or '.join(used)}, got {form!r}")
@@ -363,7 +356,7 @@ def import_parser() -> argparse.ArgumentParser:
     parser = _bridge_parser("import")
     add = parser.add_argument
     add("path", type=Path, metavar="PATH", help="file or folder to read")
-    forms = ("lerobot", "mcap", "rrd")
+    forms = tuple(name for name, form in FORMATS.items() if form.import_options is not None)
     add("--format", choices=forms, help="input format (default: that of the content)")
     prefix = "prefix of every id, but not of our own mcap exports"
     add("--id-prefix", default="", metavar="TEXT", help=prefix)

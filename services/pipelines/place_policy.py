@@ -41,7 +41,7 @@ from services.world_model.checkpoints import read_state_checkpoint
 from services.world_model.dynamics.features import DynamicsConfig, hand_motion
 from services.world_model.dynamics.model import first_steps, mean_poses
 from services.world_model.dynamics.start_reader import StartReader
-from services.world_model.dynamics.trees import stacked
+from services.world_model.dynamics.tensor_trees import stacked
 
 KIND: Final = "place-policy"
 _IMAGINED: Final[tuple[Origin, ...]] = ("imagined",)

@@ -20,7 +20,7 @@ from services.evaluation.command_line import (
     print_scores,
 )
 from services.evaluation.matched_starts import StudyWorlds
-from services.evaluation.policies.replay import ReplayPolicy
+from services.evaluation.policies.open_loop import ReplayPolicy
 from services.evaluation.progress import Progress
 from services.evaluation.scores import REAL, Outcome
 from services.evaluation.settings import DEFAULT_PROBE, ServedWorld

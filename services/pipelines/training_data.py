@@ -21,7 +21,7 @@ from dextouch.errors import ConflictError, DeviceError, InvalidInputError, Unkno
 from dextouch.jobs import Workers, run_jobs
 from dextouch.schemas import RolloutStart, SceneObjects
 from dextouch.serving import configure_logging
-from services.evaluation.policies.outside import PolicySource, action_chunk, ask
+from services.evaluation.policies.user_policies import PolicySource, action_chunk, ask
 from services.evaluation.progress import Progress
 from services.pipelines.parsers import training_data_parser
 from services.twin.cameras import Markers, marked_objects

@@ -26,7 +26,7 @@ from services.world_model.settings import (
     WorldModelSettings,
 )
 from services.world_model.training.distribution import joined_processes
-from services.world_model.training.trainer import TrainingProgress, TrainingReport, train
+from services.world_model.training.joint_trainer import TrainingProgress, TrainingReport, train
 from services.world_model.world import open_world
 
 if TYPE_CHECKING:

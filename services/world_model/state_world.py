@@ -21,7 +21,7 @@ from dextouch.schemas import (
 )
 from dextouch.streams import HEAD_CAMERA, pack
 from dextouch.worlds import StartedRollout, SteppedRollout
-from services.world_model import starts
+from services.world_model import predicted_world
 from services.world_model.checkpoints import StateCheckpoint
 from services.world_model.dynamics import features, model
 from services.world_model.network.configuration import NetworkConfig
@@ -34,8 +34,6 @@ from services.world_model.network.inputs import (
 from services.world_model.rendering.rasters import SceneStates
 from services.world_model.rendering.renderer import Drawing, Renderer
 
-MAX_SNAPSHOT_BYTES = 2**20
-MAX_CHUNK_STEPS = 64
 # Pose reported for objects believed absent: below the table, where no task places one.
 ABSENT_POSE = np.array([0.0, 0.0, -1.0, 1.0, 0.0, 0.0, 0.0], dtype=np.float32)
 # A rollout is flagged once its hands have moved 1.5 times the length of a training episode.
@@ -62,7 +60,7 @@ class StateRollout:
     num_moving: int = 0
 
 
-class StateWorld(starts.PredictedWorld[StateRollout]):
+class StateWorld(predicted_world.PredictedWorld[StateRollout]):
     """A deterministic world of a state model; raises InvalidInputError unless it is in float32."""
 
     def __init__(self, checkpoint: StateCheckpoint) -> None:
@@ -91,7 +89,6 @@ class StateWorld(starts.PredictedWorld[StateRollout]):
             action_kinds=ACTION_KINDS,
             starts_from=("observation",),
             chunk_multiple=features.STEPS_PER_LATENT,
-            max_chunk_steps=MAX_CHUNK_STEPS,
             object_names=self._metadata.object_names,
             scales_images=True,
             tactile_layout=config.layout,
@@ -100,7 +97,7 @@ class StateWorld(starts.PredictedWorld[StateRollout]):
     @torch.inference_mode()
     def reset(self, start: RolloutStart) -> StartedRollout[StateRollout]:
         """Find the objects of an observed step; raises as `observed_start`, `build_inputs`."""
-        first = starts.observed_start(
+        first = predicted_world.observed_start(
             start,
             tasks=self._description.tasks,
             layout=self._metadata.dynamics.tactile_layout,
@@ -135,9 +132,9 @@ class StateWorld(starts.PredictedWorld[StateRollout]):
         seen = first.observation(self._poses(memory.poses, start.task))
         return StartedRollout(rollout, seen, first.anchor, first.K_head)
 
-    def _check_start(self, start: RolloutStart, first: starts.ObservedStart) -> None:
+    def _check_start(self, start: RolloutStart, first: predicted_world.ObservedStart) -> None:
         """Checks of all world models: hands and camera must be within reach."""
-        starts.check_geometry(first.anchor, first.K_head)
+        predicted_world.check_geometry(first.anchor, first.K_head)
         request = PredictionRequest(
             first_image=first.image,
             first_tactile_kpa=first.tactile_kpa,
@@ -172,7 +169,7 @@ class StateWorld(starts.PredictedWorld[StateRollout]):
             "objects' place": imagined.poses.position_m,
             "objects' direction": imagined.poses.axes,
         }
-        starts.refuse_non_finite("state model", checked)
+        predicted_world.refuse_non_finite("state model", checked)
         answers = [
             self._answer(
                 replace(
@@ -312,7 +309,7 @@ class StateWorld(starts.PredictedWorld[StateRollout]):
 
     def restore(self, data: bytes) -> StateRollout:
         """Restore a snapshot; raises InvalidInputError or NonFiniteError for another's."""
-        fields, arrays = starts.opened_snapshot(data, self._digest, max_bytes=MAX_SNAPSHOT_BYTES)
+        fields, arrays = predicted_world.opened_snapshot(data, self._digest)
         config, name = self._metadata.dynamics, fields.get("task")
         step, moving = fields.get("step"), fields.get("num_moving")
         size = (config.image_px, config.image_px, 3)
@@ -324,9 +321,9 @@ class StateWorld(starts.PredictedWorld[StateRollout]):
             or arrays.get("image", np.zeros(0)).dtype != np.uint8
             or any(key not in arrays or arrays[key].shape != shapes[key] for key in shapes)
         ):
-            raise starts.foreign_snapshot(fields, arrays)
+            raise predicted_world.foreign_snapshot(fields, arrays)
         anchor, K_head = AnchorPoses(*np.array(arrays["anchor"])), np.array(arrays["K_head"])
-        starts.check_geometry(anchor, K_head)
+        predicted_world.check_geometry(anchor, K_head)
         memory = model.memory_from_arrays(arrays, config, self._metadata.num_members)
         if int(memory.start.task[0, 0]) != config.tasks.index(name):
             raise InvalidInputError(f"snapshot: its memory belongs to another task than {name!r}")

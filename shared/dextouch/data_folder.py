@@ -2,6 +2,7 @@
 
 import os
 from pathlib import Path, PurePath
+from typing import TypeGuard
 
 from dextouch.errors import InvalidInputError, LimitExceededError, NotFoundError, StorageError
 
@@ -45,6 +46,11 @@ def default_enrolment() -> Path:
 def default_spool() -> Path:
     """Where a station keeps its takes until they are uploaded."""
     return data_folder() / "spool"
+
+
+def is_bucket_url(url: str | Path) -> TypeGuard[str]:
+    """Whether a store's URL is that of a bucket, s3://…, and not a folder."""
+    return isinstance(url, str) and url.startswith("s3://")
 
 
 def practice_spool(spool: Path) -> Path:

@@ -13,8 +13,8 @@ from services.twin.settings import TwinSettings
 from services.twin.stage import Stage
 from services.world_model.checkpoints import read_checkpoint
 from services.world_model.settings import paper_form_checkpoint
-from services.world_model.training.dataset import EpisodeArrays, WindowPosition, load_episodes
 from services.world_model.training.evaluation import evaluate_prediction, predict_all
+from services.world_model.training.joint_dataset import EpisodeArrays, WindowPosition, load_episodes
 
 # Far from the seeds of training and of the checkpoint's own held-out set.
 FIRST_SEED = 20_000

@@ -18,6 +18,7 @@ from tests.unit.evaluation.study_rows import (
     counted,
     disagreements,
     interval,
+    kendall,
     lines,
     mmrv,
     pearson,
@@ -77,7 +78,7 @@ def test_a_study_that_runs_and_ends(opened, root):
     for task in ROWS:
         for world in WORLDS[1:]:
             place = f"#agreement tr[data-task={task}][data-world={world}]"
-            for name, expected in (("pearson", pearson), ("mmrv", mmrv)):
+            for name, expected in (("pearson", pearson), ("kendall", kendall), ("mmrv", mmrv)):
                 shown = opened.locator(f"{place} [data-figure={name}] strong").inner_text()
                 assert float(shown) == pytest.approx(expected(task, world), abs=0.0051)
 

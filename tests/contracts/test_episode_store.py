@@ -224,8 +224,8 @@ def test_an_id_can_be_used_again_after_it_was_deleted(place):
     other = place.again()
     with begin_recording(place.store, num_samples=9)[0]:
         pass
-    before = place.store.stamps({"take-1": 0}, kind="recording")
-    assert other.stamps({"take-1": 0}, kind="recording") == before
+    before = place.store.fingerprints({"take-1": 0}, kind="recording")
+    assert other.fingerprints({"take-1": 0}, kind="recording") == before
     other.delete("take-1", kind="recording")
     assert place.keys("recordings") == []
     assert place.store.list(kind="recording") == []
@@ -234,7 +234,7 @@ def test_an_id_can_be_used_again_after_it_was_deleted(place):
     with begin_recording(place.store, num_samples=30)[0]:
         pass
     assert other.recording("take-1").num_samples("force") == 30
-    assert other.stamps({"take-1": 0}, kind="recording") != before
+    assert other.fingerprints({"take-1": 0}, kind="recording") != before
 
 
 def test_what_is_not_there(store):

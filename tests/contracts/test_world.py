@@ -31,11 +31,11 @@ from services.world_model.checkpoints import (
 )
 from services.world_model.dynamics.features import DynamicsConfig
 from services.world_model.dynamics.model import DynamicsModel
+from services.world_model.joint_world import JointWorld
 from services.world_model.network.configuration import NetworkConfig, RendererConfig
 from services.world_model.network.model import JointWorldModel
 from services.world_model.rendering.renderer import RendererNetwork
 from services.world_model.state_world import StateWorld
-from services.world_model.world import ModelWorld
 from tests.unit.worlds.fakes import K_HEAD, BatchSumWorld, anchor, observation
 
 INSTRUCTION = "stand the bottle upright"
@@ -142,7 +142,7 @@ def untrained_state_checkpoint(instructions: tuple[str, ...] = ()) -> StateCheck
 CANDIDATES = {
     "twin": Candidate(twin, from_seed),
     "world-model": Candidate(
-        lambda: ModelWorld(untrained_checkpoint()), from_observation, batch_tolerance=1e-2
+        lambda: JointWorld(untrained_checkpoint()), from_observation, batch_tolerance=1e-2
     ),
     "state-model": Candidate(
         lambda: StateWorld(untrained_state_checkpoint()), from_observation, batch_tolerance=1e-2

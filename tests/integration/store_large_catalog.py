@@ -15,7 +15,7 @@ from functools import partial
 from pathlib import Path
 
 from benchmarks.alignment.benchmark import record
-from dextouch.episodes import EpisodeStore, Stamps
+from dextouch.episodes import EpisodeStore, GroupFingerprint
 from dextouch.episodes.format import decode_commit, encode_commit, sha256_hex
 from dextouch.episodes.spool import SpoolReader
 from services.alignment.jobs import align_recording
@@ -71,9 +71,9 @@ class ListedStore(EpisodeStore):
         """Names and numbers of folders."""
         return {name: number for number, name in enumerate(self.names[kind])}
 
-    def stamps(self, numbers, *, kind="episode"):
-        """Stamps as those of the rows."""
-        return {name: Stamps(number, "", "") for name, number in numbers.items()}
+    def fingerprints(self, numbers, *, kind="episode"):
+        """Fingerprints as those of the rows."""
+        return {name: GroupFingerprint(number, "", "") for name, number in numbers.items()}
 
 
 def rows_alone(store, folder, count):
@@ -81,7 +81,7 @@ def rows_alone(store, folder, count):
     listed = ListedStore(folder)
     (folder / "episodes").mkdir(parents=True)
     (episode_id,) = [name for name in store.list() if not name.startswith("e-")]
-    row = read_row(store, "episode", episode_id, Stamps(0, "", ""))
+    row = read_row(store, "episode", episode_id, GroupFingerprint(0, "", ""))
     file = CatalogFile(folder)
     connection, _ = file.connection()
     listed.names = {"episode": [f"e-{number:06d}" for number in range(count)], "recording": []}

@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from dextouch.episodes import EpisodeStore, care, select_episodes
+from dextouch.episodes import EpisodeStore, maintenance, select_episodes
 from dextouch.episodes.editing import (
     EditOptions,
     MergeOptions,
@@ -86,7 +86,7 @@ def check(edit, folder, places):
         found.add(chosen)
         assert chosen in {("a",), ("a", "b")} if edit is merge else {("a",), ("b",)}
         for name in ours.list():
-            assert not care.inspect_group(ours.files(name), "episode").damaged
+            assert not maintenance.inspect_group(ours.files(name), "episode").damaged
         # Repeated, it is done.
         if ours.exists("a"):
             edit(root)

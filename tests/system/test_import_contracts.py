@@ -20,7 +20,7 @@ OFFENCES = [
     ("Services do not import each other", "services/twin/scene.py", "import services.evaluation"),
     ("Layers of dextouch", "shared/dextouch/geometry/transforms.py", "import dextouch.schemas"),
     ("torch only where networks are", "services/twin/scene.py", "import torch"),
-    ("zarr only in dextouch.episodes and", "services/cli/exports.py", "import zarr"),
+    ("zarr only in dextouch.episodes and", "services/cli/import_export.py", "import zarr"),
     (
         "Drivers and packets never import mocks",
         "services/acquisition/drivers/base.py",
@@ -30,7 +30,7 @@ OFFENCES = [
     (
         "Layers of the world model",
         "services/world_model/network/conditioning.py",
-        "import services.world_model.training.trainer",
+        "import services.world_model.training.joint_trainer",
     ),
     (
         "Layers of alignment",

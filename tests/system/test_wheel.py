@@ -130,7 +130,7 @@ def test_the_extras_name_what_every_module_imports(installed):
     absent = json.loads(installed.run("python", "-c", IMPORT_ALL, limit_s=600))
     # The viewer and Ray have extras of their own, which `all` leaves out.
     apart = [
-        ["dextouch.bridges.foreign_rerun", "rerun"],
+        ["dextouch.bridges.import_rerun", "rerun"],
         ["dextouch.bridges.rerun", "rerun"],
         ["dextouch_services.pipelines.ray_serve", "ray"],
     ]

@@ -12,7 +12,7 @@ from services.acquisition.devices import load_calibration
 from services.alignment.station_calibration import record
 from services.dashboard.pages import DEFAULT_TASKS, load_tasks
 from services.dashboard.settings import DashboardSettings
-from services.evaluation.rating.marks import BUNDLED, read_rubrics
+from services.evaluation.rating.rubrics import BUNDLED, read_rubrics
 
 POSES = "image,x_m,y_m,z_m,qw,qx,qy,qz\r\na.jpg,0,0,0.5,1,0,0,0\r\n"
 

@@ -6,7 +6,7 @@ import pytest
 
 from dextouch.data_folder import data_folder
 from dextouch.episodes import EpisodeStore
-from dextouch.episodes.object_bucket import parse_address
+from dextouch.episodes.s3_bucket import parse_address
 from dextouch.errors import InvalidInputError
 from services.acquisition.settings import AcquisitionSettings
 from services.alignment.settings import AlignmentSettings

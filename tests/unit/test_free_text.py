@@ -32,7 +32,7 @@ from services.dashboard.settings import DashboardSettings
 from services.episode_store.app import create_app
 from services.episode_store.settings import EpisodeStoreSettings
 from services.evaluation.rating.app import SubmittedMark
-from services.evaluation.rating.marks import Criterion
+from services.evaluation.rating.rubrics import Criterion
 
 # Clears a screen, forges a line, turns the reading order, hides.
 BAD = [

@@ -123,7 +123,7 @@ def test_promised_modules_are_public():
         "def late():\n    from dextouch.clocks.clock_model import find_steps",
         "from dextouch.bridges.lerobot.layout import frames_of",
         "from dextouch.hands.hand_files.loading import load_hand",
-        "from dextouch.episodes.care.repair import repair_group",
+        "from dextouch.episodes.maintenance.repair import repair_group",
     ],
 )
 @pytest.mark.parametrize("importer", ["", "dextouch.worlds.routes"])
@@ -136,10 +136,10 @@ def test_an_import_past_a_door_is_found(line, importer):
     [
         ("from dextouch.streams import decode_batch", ""),
         ("from dextouch.streams.batch import decode_batch", "dextouch.streams.samples"),
-        ("from dextouch.bridges.exporting import blocks", "dextouch.bridges.lerobot.video"),
+        ("from dextouch.bridges.export_files import blocks", "dextouch.bridges.lerobot.video"),
         ("from dextouch.hands.actions import reanchor", "dextouch.worlds.routes"),
         ("from dextouch.hands.hand_files import load_hand", ""),
-        ("from dextouch.episodes.files import disk_errors", "dextouch.episodes.care.repair"),
+        ("from dextouch.episodes.files import disk_errors", "dextouch.episodes.maintenance.repair"),
         ("from dextouch.metrics import tactile", ""),
         ("from dextouch.errors import ShapeError", ""),
     ],

@@ -17,7 +17,7 @@ from services.twin.settings import TwinSettings
 from services.twin.stage import Stage
 from services.twin.take_options import TakeOptions
 from services.world_model.settings import TrainStateCommand
-from services.world_model.training.dataset import index_episodes, load_episodes
+from services.world_model.training.joint_dataset import index_episodes, load_episodes
 from services.world_model.training.state_data import load_state_data
 from services.world_model.training.tokenizer_trainer import load_hands
 

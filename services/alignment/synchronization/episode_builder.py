@@ -10,7 +10,14 @@ from jaxtyping import Bool, Float64
 from dextouch.episodes import RecordingReader
 from dextouch.errors import InvalidInputError
 from dextouch.geometry import nearest_index
-from dextouch.schemas import Domain, EpisodeAttributes, LineageEntry, Matrix, StoredAnchor
+from dextouch.schemas import (
+    SHARED_ATTRIBUTES,
+    Domain,
+    EpisodeAttributes,
+    LineageEntry,
+    Matrix,
+    StoredAnchor,
+)
 from dextouch.streams import (
     BODIES,
     COMMANDED,
@@ -61,11 +68,6 @@ from services.alignment.synchronization.resampling import (
 
 # Samples without which a stream is as if it were not there.
 MIN_USABLE = 2
-# What an episode takes over from its recording.
-SHARED_ATTRIBUTES = (
-    *("task", "instruction", "domain", "station", "operator", "trace_id"),
-    *("success", "recovered", "complete", "incomplete_cause"),
-)
 
 
 @dataclass(frozen=True)
@@ -82,7 +84,7 @@ class BuiltEpisode:
 
 
 @dataclass(frozen=True)
-class _Stretch:
+class EpisodeSpan:
     """The part of a recording that becomes the episode; `matrices` say why the rest does not."""
 
     gridded: GriddedStreams
@@ -253,9 +255,9 @@ def build_episode(
     }
     streams = {name: one.stream for name, one in checked.items()}
     check_bodies(streams, recording.attributes.domain)
-    stretch = _find_stretch(recording, checked, options, on_progress)
+    span = find_span(recording, checked, options, on_progress)
     on_progress(progress_within("retargeting", 0.0))
-    source, gridded = recording.attributes, stretch.gridded
+    source, gridded = recording.attributes, span.gridded
     actions = make_actions(
         gridded,
         source.domain,
@@ -263,7 +265,7 @@ def build_episode(
         wrist=options.wrist,
         max_gap_ns=options.max_gap_ns,
     )
-    inside_ns = (stretch.origin_ns, stretch.origin_ns + int(np.ptp(gridded.grid_ns)))
+    inside_ns = (span.origin_ns, span.origin_ns + int(np.ptp(gridded.grid_ns)))
     seen = marker_streams(
         recording,
         streams,
@@ -276,13 +278,13 @@ def build_episode(
     grid_ns = gridded.grid_ns - gridded.grid_ns[0]
     written = [
         *_action_streams(actions, grid_ns, options),
-        *(cut_stream(one, stretch.origin_ns, int(grid_ns[-1])) for one in streams.values()),
+        *(cut_stream(one, span.origin_ns, int(grid_ns[-1])) for one in streams.values()),
         *seen,
     ]
     quality = {
-        "num_steps_refused": float(stretch.num_refused),
-        "num_steps_interpolated": float(_num_interpolated(stretch, actions)),
-        "origin_after_start_ns": float(stretch.origin_ns - (source.started_t_host_ns or 0)),
+        "num_steps_refused": float(span.num_refused),
+        "num_steps_interpolated": float(_num_interpolated(span, actions)),
+        "origin_after_start_ns": float(span.origin_ns - (source.started_t_host_ns or 0)),
         **_stream_quality(streams, options),
         **actions.quality,
     }
@@ -291,7 +293,7 @@ def build_episode(
     more = {
         "model_rate_hz": options.model_rate_hz,
         "calibration": attributes.calibration
-        | stretch.matrices
+        | span.matrices
         | interpolated_fingers(grid_ns, actions.unseen_fingers),
         "object_names": tuple(one.name for one in listed),
         "object_boxes_m": tuple(one.box_m for one in listed),
@@ -309,20 +311,20 @@ def _dated_streams(recording: RecordingReader, on_progress: OnProgress) -> dict[
     return streams
 
 
-def _num_interpolated(stretch: _Stretch, actions: GridActions) -> int:
+def _num_interpolated(span: EpisodeSpan, actions: GridActions) -> int:
     """Steps in gaps of a stream, or of a finger that other steps have."""
-    found = stretch.interpolated.copy()
+    found = span.interpolated.copy()
     for unseen in actions.unseen_fingers.values():
         found |= unseen[:, ~unseen.all(axis=0)].any(axis=1)
     return int(np.count_nonzero(found))
 
 
-def _find_stretch(
+def find_span(
     recording: RecordingReader,
     checked: Mapping[str, CheckedStream],
     options: AlignmentOptions,
     on_progress: OnProgress,
-) -> _Stretch:
+) -> EpisodeSpan:
     """Load the streams that actions are made of and choose the longest stretch that all share."""
     attributes, streams = recording.attributes, {n: one.stream for n, one in checked.items()}
     where = f"recording {attributes.recording_id!r}"
@@ -374,7 +376,7 @@ def _find_stretch(
     refused += refused_stretches(grid_ns + origin_ns, valid, (first, stop), start_ns)
     inside = {name: mine[first:stop] for name, mine in valid.items()}
     causes_ns = {name: one.parts_ns for name, one in checked.items()}
-    return _Stretch(
+    return EpisodeSpan(
         place_streams(moved, grid_ns[first:stop], max_gap_ns=options.longest_bridge_ns),
         origin_ns + int(grid_ns[first]),
         num_steps - (stop - first),

@@ -3,7 +3,7 @@
 import { attempt, button, cell, element, find, headRow, newestOnly, onClick, say, setText } from "./dom.js";
 import { LiveLink } from "./live.js";
 import { ask, checked, get, getIfServed } from "./requests.js";
-import { agreementRow, rateCell, rateRows, rolloutRow, stateBadge, studyProgress } from "./study_tables.js";
+import { FIGURES, agreementRow, rateCell, rateRows, rolloutRow, stateBadge, studyProgress } from "./study_tables.js";
 
 // Missing values come last in either direction.
 function sorted(rows, valueOf, descending) {
@@ -53,11 +53,10 @@ function showFigures() {
   find("study_state").replaceChildren(stateBadge(summary), studyProgress(summary));
   setText(find("summary"), summary.worlds.length ? `${figures.num_disagreements} imagined outcomes differ from the real ones` : "no imagined world to compare");
   setText(find("rate_meaning"), `${meanings.rate} Cannot tell: ${meanings.unreliable}`);
-  const named = [["Pearson", "pearson"], ["Mean absolute error", "mean_absolute_error"], ["MMRV", "mmrv"], ["Bias", "bias"], ["Intervals", "interval"]];
-  find("meanings").replaceChildren(...named.flatMap(([label, key]) => [element("dt", {}, label), element("dd", {}, meanings[key])]));
+  find("meanings").replaceChildren(...[...FIGURES, ["interval", "Intervals"]].flatMap(([key, label]) => [element("dt", {}, label), element("dd", {}, meanings[key])]));
   showRates();
   const chance = "share of all pairings of the policies' rates that correlate at least as well";
-  const numbers = ["Pearson", "Mean absolute error", "MMRV", "Bias", "Chance", "Policies × starts"];
+  const numbers = [...FIGURES.map(([, label]) => label), "Chance", "Policies × starts"];
   const heads = numbers.map((label) => [label, { class: "number", title: label === "Chance" ? chance : null }]);
   showTable("agreement", ["World", "Task", ...heads, "Comments"], figures.agreement.map(agreementRow));
   showChoices(summary);

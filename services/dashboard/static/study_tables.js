@@ -69,12 +69,14 @@ function figureCell(one, name, caution = "") {
   return cell([element("strong", {}, number(one.figures[name], 2)), " ", element("span", { class: "quiet" }, range), why(caution, "caution")], "number", { "data-figure": name });
 }
 
+// Figures of agreement that have a column: their keys in a study's figures, and their titles.
+export const FIGURES = [["pearson", "Pearson"], ["kendall", "Kendall"], ["mean_absolute_error", "Mean absolute error"], ["mmrv", "MMRV"], ["bias", "Bias"]];
 export function agreementRow(one) {
   const comments = one.comments.length ? element("details", {}, element("summary", {}, "What this shows"),
     element("ul", {}, ...one.comments.map((text) => element("li", {}, text)))) : null;
   return element("tr", { "data-world": one.world, "data-task": one.task },
     cell(one.world, "name"), cell(one.task || "all tasks together"),
-    figureCell(one, "pearson", one.is_vague ? "too wide to tell a faithful world from a poor one" : ""), figureCell(one, "mean_absolute_error"), figureCell(one, "mmrv"), figureCell(one, "bias"),
+    ...FIGURES.map(([name]) => figureCell(one, name, name === "pearson" && one.is_vague ? "too wide to tell a faithful world from a poor one" : "")),
     cell(one.chance === null ? "–" : one.chance < 0.001 ? "< 0.001" : one.chance.toFixed(3), "number"),
     cell(`${one.num_policies} × ${one.num_starts}`, "number"), cell(comments, "free"));
 }

@@ -22,15 +22,7 @@ from dextouch.serving import (
     serve,
 )
 from services.evaluation.rating.invitations import Invitations, invitation_router
-from services.evaluation.rating.marks import (
-    Judgement,
-    Mark,
-    MarkLog,
-    RaterName,
-    Rubric,
-    read_rubrics,
-    rubric_of,
-)
+from services.evaluation.rating.marks import Judgement, Mark, MarkLog, RaterName
 from services.evaluation.rating.rating_queue import (
     RatedRollout,
     RatingQueue,
@@ -38,6 +30,7 @@ from services.evaluation.rating.rating_queue import (
     rated_rollouts,
 )
 from services.evaluation.rating.rating_report import rating_report
+from services.evaluation.rating.rubrics import Rubric, read_rubrics, rubric_of
 from services.evaluation.settings import RatingSettings
 
 STATIC: Final = FilePath(__file__).parent / "static"

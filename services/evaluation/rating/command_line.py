@@ -5,11 +5,12 @@ from collections.abc import Sequence
 from dextouch.command_line import write_result
 from dextouch.episodes import EpisodeStore
 from dextouch.serving import load_settings
-from services.evaluation.rating.marks import MarkLog, read_rubrics
+from services.evaluation.rating.marks import MarkLog
 from services.evaluation.rating.rating_queue import rated_rollouts, state_scores
 from services.evaluation.rating.rating_report import rating_report
+from services.evaluation.rating.rubrics import read_rubrics
+from services.evaluation.rendering import rendered
 from services.evaluation.settings import RatingReportSettings
-from services.evaluation.templates import rendered
 
 
 def report_main(argv: Sequence[str]) -> int:

@@ -22,11 +22,11 @@ from services.evaluation.rating.marks import (
     REPEAT,
     Mark,
     MarkLog,
-    Rubric,
     StoredMark,
     by_people,
     vote,
 )
+from services.evaluation.rating.rubrics import Rubric
 from services.evaluation.reporting.pictures import hands_image
 
 # A rater is shown a rollout again after this many other marks, at least.

@@ -13,23 +13,15 @@ from typing import Any, Final, Literal
 import numpy as np
 from jaxtyping import Float64
 
-from services.evaluation.rating.marks import (
-    FIRST,
-    REPEAT,
-    Mark,
-    Rubric,
-    StoredMark,
-    by_people,
-    rubric_of,
-    vote,
-)
+from services.evaluation.rating.marks import FIRST, REPEAT, Mark, StoredMark, by_people, vote
+from services.evaluation.rating.rubrics import Rubric, rubric_of
+from services.evaluation.rendering import UNDEFINED
 from services.evaluation.statistics import (
     Interval,
     bootstrap_mean_interval,
     central_interval,
     start_counts,
 )
-from services.evaluation.templates import UNDEFINED
 
 Level = Literal["nominal", "interval"]
 LEAST_ALPHA: Final = 0.667

@@ -15,6 +15,8 @@ from typing import Any
 
 from dextouch import __version__
 from dextouch.free_text import printable
+from services.evaluation.agreement import FIGURES
+from services.evaluation.rendering import environment
 from services.evaluation.reporting.pictures import (
     FULL_SCALE_KPA,
     MAX_MOVING,
@@ -27,7 +29,6 @@ from services.evaluation.reporting.pictures import (
     scale_colours,
 )
 from services.evaluation.reporting.sections import (
-    AGREEMENT,
     ERRORS,
     clock_rows,
     comparison_bars,
@@ -36,7 +37,6 @@ from services.evaluation.reporting.sections import (
     tiles,
     undecided_note,
 )
-from services.evaluation.templates import environment
 
 
 def write_report(report: Mapping[str, Any], pictures: ReportPictures, path: Path) -> None:
@@ -55,7 +55,7 @@ def write_report(report: Mapping[str, Any], pictures: ReportPictures, path: Path
         action_charts=action_charts(pictures.actions),
         comparisons=comparison_bars(report.get("world_model", {})),
         policies=policy_panels(report),
-        agreement_names=AGREEMENT,
+        agreement_figures=FIGURES,
         failures=failure_rows(report),
         undecided_note=undecided_note,
         pictures=pictures,

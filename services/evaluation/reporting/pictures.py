@@ -26,8 +26,8 @@ from dextouch.tactile.layout import (
     Side,
     TactileLayout,
 )
+from services.evaluation.rendering import is_number, rendered
 from services.evaluation.reporting.policy_picture import NAMESPACE, Rate, policy_picture
-from services.evaluation.templates import is_number, rendered
 
 # Photographs larger than this are embedded as JPEG.
 MAX_PNG_SIDE_PX = 256

@@ -7,7 +7,7 @@ from typing import Final, Literal, NamedTuple
 
 from PIL import Image, ImageDraw, ImageFont
 
-from services.evaluation.templates import rendered
+from services.evaluation.rendering import rendered
 
 Format = Literal["svg", "png", "tex"]
 # A success rate with the ends of its interval.

@@ -5,8 +5,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
+from services.evaluation.agreement import FIGURES
+from services.evaluation.rendering import UNDEFINED, escape_latex, figure, is_number, rendered
 from services.evaluation.scores import REAL, ClosedLoopReport
-from services.evaluation.templates import UNDEFINED, escape_latex, figure, is_number, rendered
 
 # Key of the figure, its name on the page, its unit, and its bound, if any.
 ERRORS: tuple[tuple[str, str, str, tuple[str, float] | None], ...] = (
@@ -17,15 +18,6 @@ ERRORS: tuple[tuple[str, str, str, tuple[str, float] | None], ...] = (
     ("fingertip_error_mm", "Fingertip error", "mm", None),
 )
 CLOCK_BOUND_MS = 1.0
-AGREEMENT: tuple[tuple[str, str], ...] = (
-    ("pearson", "Pearson"),
-    ("mmrv", "MMRV, ties counted"),
-    ("mmrv_paper", "MMRV, paper's rule"),
-    ("spearman", "Spearman"),
-    ("kendall", "Kendall"),
-    ("bias", "mean of imagined minus real"),
-    ("mean_absolute_error", "mean absolute error"),
-)
 # Image baselines that the model must beat; the camera motion is known to all but the copy.
 IMAGE_RIVALS = ("psnr_copy", "psnr_warp", "psnr_hands_still")
 _FAILURE_FIELDS = ("policy", "world", "error", "message", "traceback")
@@ -47,7 +39,7 @@ COMPARISONS: tuple[tuple[str, str, str, str, str, tuple[str, ...]], ...] = (
      ("zero", *_OF_CONTACT)),
     ("Contact, F1", "", "more is better", "contact_f1", "touch", _OF_CONTACT),
 )  # fmt: skip
-_FIGURES: Final = {"pearson": "Pearson", "mmrv": "MMRV", "mmrv_paper": "MMRV (paper)"}
+LATEX_FIGURES: Final = ("pearson", "kendall", "mmrv", "mmrv_paper")
 
 
 @dataclass(frozen=True)
@@ -238,6 +230,6 @@ def latex_tables(report: ClosedLoopReport) -> str:
         rows={(row["task"], row["policy"]): row for row in report.policy_rows()},
         worlds={REAL: "Real world"} | {one: escape_latex(one) for one in report.imagined_worlds},
         agreement=agreement,
-        figures=_FIGURES,
+        figures={name: FIGURES[name].title for name in LATEX_FIGURES},
         undecided_note=undecided_note,
     )

@@ -14,8 +14,8 @@ from dextouch.errors import UnavailableError
 from services.evaluation.bundled_policies import bundled_policy, checkpoint_of, training_starts_of
 from services.evaluation.closed_loop import EvaluationPlan, RolloutRunner, begin_matched
 from services.evaluation.matched_starts import FailedStart, MatchedStart, StudyWorlds
-from services.evaluation.policies.outside import PolicySource
-from services.evaluation.policies.replay import ReplayPolicy
+from services.evaluation.policies.open_loop import ReplayPolicy
+from services.evaluation.policies.user_policies import PolicySource
 from services.evaluation.progress import Progress
 from services.evaluation.scores import REAL, ClosedLoopReport, Outcome, RolloutFailure
 from services.evaluation.studies.results import (

@@ -16,7 +16,9 @@ from dextouch.command_line import write_result
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import DexTouchError, UnknownNameError
 from dextouch.frozen_model import FrozenModel
+from services.evaluation.agreement import FIGURES
 from services.evaluation.closed_loop import example_pairs, title_of
+from services.evaluation.rendering import UNDEFINED
 from services.evaluation.reporting import write_report
 from services.evaluation.reporting.pictures import (
     MAX_MOVING,
@@ -45,7 +47,6 @@ from services.evaluation.studies.results import (
     rollout_episode_id,
     study_report,
 )
-from services.evaluation.templates import UNDEFINED
 
 logger = structlog.get_logger(__name__)
 
@@ -57,9 +58,6 @@ MEANINGS: Final = {
         Path(__file__).with_name("meanings.toml").read_text(encoding="utf-8")
     ).items()
 }
-FIGURES_SHOWN: Final = (
-    "pearson", "spearman", "kendall", "mmrv", "bias", "mean_absolute_error",
-)  # fmt: skip
 REPORT_FILE: Final = "report.json"
 TABLES_FILE: Final = "tables.tex"
 
@@ -83,9 +81,9 @@ class StudySummary(FrozenModel):
 class StudyRate(FrozenModel):
     """Success rate of a policy in a task of a world, with its 95 % Wilson interval.
 
-    It is None without decided rollouts: the success classifier abstains on `num_unreliable`, for
-    `reasons`, which count in no rate; `is_comparable` if it decided enough. `num_missing` have no
-    result yet, and `num_disagreements` starts have another outcome than in the real world.
+    It is None without decided rollouts: the success classifier leaves `num_unreliable` undecided,
+    for `reasons`; they count in no rate; `is_comparable` if it decided enough. `num_missing` have
+    no result yet, and `num_disagreements` starts have another outcome than in the real world.
     """
 
     world: str
@@ -281,11 +279,11 @@ def _agreement(report: ClosedLoopReport, world: str) -> Iterator[StudyAgreement]
         tasks = tasks | {"": alone["agreement_of_all_tasks"] | counted}
     for task, found in tasks.items():
         known = {name: None if isinstance(v, str) else v for name, v in found.items()}
-        intervals: dict[str, Any] = {n: known.get(f"{n}_interval") for n in FIGURES_SHOWN}
+        intervals: dict[str, Any] = {n: known.get(f"{n}_interval") for n in FIGURES}
         yield StudyAgreement(
             world=world,
             task=task,
-            figures={name: known[name] for name in FIGURES_SHOWN},
+            figures={name: known[name] for name in FIGURES},
             intervals={name: one and tuple(one) for name, one in intervals.items()},
             is_vague=bool(intervals["pearson"]) and intervals["pearson"][0] < VAGUE_R,
             undefined=undefined_by(found["num_policies"]),

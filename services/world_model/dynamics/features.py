@@ -21,7 +21,7 @@ from dextouch.hands.robot_hand import chain_points_of_both_m
 from dextouch.schemas import MAX_OBJECTS, Domain
 from dextouch.tactile import MAX_CELLS
 from dextouch.tactile.layout import DEXTOUCH_V1, NUM_TAXELS, TactileLayout
-from services.world_model.dynamics.trees import mapped
+from services.world_model.dynamics.tensor_trees import mapped
 
 # Of each hand: the wrist, five fingertips, five PIP joints, and the middle of the palm.
 NUM_POINTS: Final = 12

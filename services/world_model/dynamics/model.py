@@ -31,7 +31,7 @@ from services.world_model.dynamics.features import (
     TouchCodec,
 )
 from services.world_model.dynamics.start_reader import FirstStep, Reading, StartReader
-from services.world_model.dynamics.trees import (
+from services.world_model.dynamics.tensor_trees import (
     Part,
     Traced,
     by_name,

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float32, UInt8
 from torch import Tensor, nn
 
-from services.world_model.dynamics.trees import combined, mapped
+from services.world_model.dynamics.tensor_trees import combined, mapped
 from services.world_model.network import flow_matching
 from services.world_model.network.attention import (
     ExpertBlock,

@@ -21,7 +21,7 @@ from jaxtyping import Float, Float32, Float64, UInt8
 from torch import Tensor, nn
 from torch.nn import functional
 
-from services.world_model.dynamics.trees import Traced, mapped
+from services.world_model.dynamics.tensor_trees import Traced, mapped
 from services.world_model.network.configuration import RendererConfig
 from services.world_model.network.instruction import LastUsed
 from services.world_model.rendering.inputs import (

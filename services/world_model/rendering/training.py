@@ -24,7 +24,6 @@ from services.world_model.rendering.rasters import SceneStates, joined, object_t
 from services.world_model.rendering.renderer import RendererNetwork, has_fast_bfloat16
 from services.world_model.settings import RendererTraining
 
-LOG_EVERY_STEPS = 50
 _EDGE_WINDOW_PX = 7
 # Chosen: half of the pairs begin at the first image of an episode, as rollouts do.
 _LATE_START_SHARE = 0.5
@@ -59,8 +58,8 @@ def train_renderer(
     """Train on pairs of images of one clip: a start image and a target image.
 
     `rng` draws initial weights (but those of `initial`), pairs and pose noise. `on_progress` is
-    called with the completed share, the step and the loss. Returns the averaged network and CPU
-    seconds.
+    called after each step with the completed share, the step and the loss. Returns the averaged
+    network and CPU seconds.
 
     Raises:
         InvalidInputError: no clips, several sizes of images, or unsupported sides.
@@ -73,7 +72,7 @@ def train_renderer(
     for loss in OptimizerLoop(run.network, settings.options(), budget).run(run.loss):
         weights = averaged.parameters(), run.network.parameters()
         update_average(*weights, decay=settings.ema_decay, num_updates=budget.step - 1)
-        if on_progress is not None and budget.step % LOG_EVERY_STEPS == 0:
+        if on_progress is not None:
             on_progress(min(budget.share(), 1.0), budget.step, loss)
     return averaged, budget.cpu_s
 

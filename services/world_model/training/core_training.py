@@ -20,7 +20,7 @@ from services.world_model.dynamics.features import (
 )
 from services.world_model.dynamics.model import by_pad
 from services.world_model.dynamics.start_reader import Reading
-from services.world_model.dynamics.trees import Part, chosen, mapped
+from services.world_model.dynamics.tensor_trees import Part, chosen, mapped
 from services.world_model.settings import CoreSettings
 from services.world_model.training.reader_training import UNIT_M, OnStep, train_averaged
 from services.world_model.training.scene_table import MEASURED_ERROR_M, SceneTable

@@ -12,8 +12,8 @@ from dextouch.schemas import Domain
 from services.world_model.checkpoints import TrainingSet, read_tokenizer
 from services.world_model.paper_settings import TrainSettings
 from services.world_model.settings import DataSettings
-from services.world_model.training import dataset, tokenizer_trainer
-from services.world_model.training.dataset import TrainingEpisode
+from services.world_model.training import joint_dataset, tokenizer_trainer
+from services.world_model.training.joint_dataset import StoredEpisode, TrainingEpisode
 
 # An episode of either form of the world model.
 DomainEpisode: TypeAlias = EpisodeGrid | TrainingEpisode
@@ -112,23 +112,23 @@ def training_sets(
 
 def load_split(
     settings: TrainSettings,
-) -> tuple[Sequence[TrainingEpisode], list[dataset.EpisodeArrays]]:
+) -> tuple[Sequence[TrainingEpisode], list[joint_dataset.EpisodeArrays]]:
     """Training and held-out episodes; the latter, in memory, are the same for every subset.
 
     They are never human if human stores are given.
     """
     px, views = settings.network.image_px, settings.network.further_views
-    how = dataset.index_episodes if settings.streaming else dataset.load_episodes
+    how = joint_dataset.index_episodes if settings.streaming else joint_dataset.load_episodes
     read = partial(how, splits=settings.splits, image_px=px, further_views=views)
     domain: Domain | None = "robot" if settings.human else None
     trained: Sequence[TrainingEpisode] = read(settings.episodes, domain=domain)
     if settings.heldout is not None:
-        heldout = dataset.load_episodes(
+        heldout = joint_dataset.load_episodes(
             settings.heldout, domain=domain, image_px=px, further_views=views
         )
     else:
         trained, stored = _split(trained, settings)
-        heldout = [one.load() if isinstance(one, dataset.StoredEpisode) else one for one in stored]
+        heldout = [one.load() if isinstance(one, StoredEpisode) else one for one in stored]
     trained = subset_by_hash(trained, settings.robot_episodes, what="robot")
     people: list[TrainingEpisode] = []
     for url in settings.human if settings.human_episodes != 0 else ():
@@ -160,8 +160,8 @@ def _check_views(episodes: Sequence[TrainingEpisode], settings: TrainSettings) -
 
 
 def _split(
-    episodes: Sequence[dataset.E], settings: TrainSettings
-) -> tuple[list[dataset.E], list[dataset.E]]:
+    episodes: Sequence[joint_dataset.E], settings: TrainSettings
+) -> tuple[list[joint_dataset.E], list[joint_dataset.E]]:
     if settings.tokenizer is None:
         return split_by_scene(episodes, held_out_share=settings.heldout_percent / 100)
     stored = read_tokenizer(settings.tokenizer)

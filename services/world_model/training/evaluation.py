@@ -20,7 +20,7 @@ from services.world_model.dynamics.model import DynamicsModel, ImaginedSteps, ba
 from services.world_model.network.codecs import to_uint8, to_unit
 from services.world_model.network.inputs import PredictionRequest, build_inputs
 from services.world_model.network.model import JointWorldModel, stack_noise
-from services.world_model.training import dataset
+from services.world_model.training import joint_dataset
 from services.world_model.training.reader_training import reader_errors
 from services.world_model.training.scene_table import SceneTable
 
@@ -47,7 +47,7 @@ class Futures:
 
 def evaluate_prediction(
     model: JointWorldModel,
-    episodes: Sequence[dataset.EpisodeArrays],
+    episodes: Sequence[joint_dataset.EpisodeArrays],
     *,
     train_fingerprints: Sequence[str],
     stride: int = 8,
@@ -69,7 +69,7 @@ def evaluate_prediction(
     places = [
         (episode, start)
         for episode in episodes
-        for start in dataset.window_starts(episode, model.config.max_steps).tolist()
+        for start in joint_dataset.window_starts(episode, model.config.max_steps).tolist()
         if start % stride == 0
     ]
     if not places:
@@ -120,10 +120,10 @@ def evaluate_prediction(
 
 
 def refuse_trained(
-    episodes: Sequence[dataset.TrainingEpisode], train_fingerprints: Collection[str], model: str
+    episodes: Sequence[joint_dataset.TrainingEpisode], fingerprints: Collection[str], model: str
 ) -> None:
     """Raise if a model was trained on any of the episodes, by the hash of their content."""
-    trained = set(train_fingerprints)
+    trained = set(fingerprints)
     seen = [episode.episode_id for episode in episodes if episode.fingerprint() in trained]
     if seen:
         raise InvalidInputError(
@@ -162,15 +162,15 @@ def _in_batches(
 
 
 def _cut(
-    episode: dataset.EpisodeArrays, start: int, num_steps: int, kind: ActionKind
-) -> dataset.Window:
+    episode: joint_dataset.EpisodeArrays, start: int, num_steps: int, kind: ActionKind
+) -> joint_dataset.Window:
     available: ActionKind = kind if kind in episode.actions else "measured"
-    return episode.cut(dataset.WindowPosition(0, start, num_steps, available))
+    return episode.cut(joint_dataset.WindowPosition(0, start, num_steps, available))
 
 
-def _through_codec(model: JointWorldModel, windows: Sequence[dataset.Window]) -> Futures:
-    def decoded(part: Sequence[dataset.Window], _: int) -> tuple[Tensor, Tensor]:
-        batch = dataset.stack_windows(part)
+def _through_codec(model: JointWorldModel, windows: Sequence[joint_dataset.Window]) -> Futures:
+    def decoded(part: Sequence[joint_dataset.Window], _: int) -> tuple[Tensor, Tensor]:
+        batch = joint_dataset.stack_windows(part)
         shown, felt = batch.images.to(model.device), batch.tactile_kpa.to(model.device)
         images: Tensor = model.codec.decode(model.codec.encode(to_unit(shown)))
         touch = model.tokenizer.decode(model.tokenizer.encode(felt))
@@ -180,12 +180,12 @@ def _through_codec(model: JointWorldModel, windows: Sequence[dataset.Window]) ->
 
 
 def _actions_of_other_takes(
-    places: Sequence[tuple[dataset.EpisodeArrays, int]],
+    places: Sequence[tuple[joint_dataset.EpisodeArrays, int]],
     requests: Sequence[PredictionRequest],
     kind: ActionKind,
 ) -> list[tuple[int, PredictionRequest]]:
     """Each request with the actions of the next episode of its task at the same time."""
-    by_task: dict[str, list[dataset.EpisodeArrays]] = {}
+    by_task: dict[str, list[joint_dataset.EpisodeArrays]] = {}
     for episode, _ in places:
         if all(episode is not known for known in by_task.setdefault(episode.task, [])):
             by_task[episode.task].append(episode)

@@ -22,7 +22,7 @@ from services.networks.optimizer import (
 )
 from services.world_model.dynamics.features import DynamicsConfig, ObjectPoses
 from services.world_model.dynamics.start_reader import FirstStep, Reading, StartReader
-from services.world_model.dynamics.trees import combined
+from services.world_model.dynamics.tensor_trees import combined
 from services.world_model.rendering.renderer import uses_bfloat16
 from services.world_model.settings import CoreSettings, ReaderSettings
 from services.world_model.training.scene_table import SceneTable

@@ -29,7 +29,7 @@ from services.world_model.dynamics.features import (
 )
 from services.world_model.dynamics.model import by_pad
 from services.world_model.dynamics.start_reader import FirstStep
-from services.world_model.dynamics.trees import by_name, chosen, mapped, stacked
+from services.world_model.dynamics.tensor_trees import by_name, chosen, mapped, stacked
 from services.world_model.rendering.rasters import SceneStates
 from services.world_model.rendering.training import SceneClip
 

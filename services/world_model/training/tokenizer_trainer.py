@@ -30,7 +30,7 @@ from services.world_model import checkpoints
 from services.world_model.dynamics.features import root_pressure
 from services.world_model.network.tactile import LearnedTokenizer, TactileTokenizer, build_tokenizer
 from services.world_model.paper_settings import TrainSettings, TrainTokenizerSettings
-from services.world_model.training.dataset import E, TrainingEpisode
+from services.world_model.training.joint_dataset import E, TrainingEpisode
 from services.world_model.training.scene_table import filled_touch
 
 _EVALUATION_BATCH, _TIMING_ROUNDS = 1000, 5

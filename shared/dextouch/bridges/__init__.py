@@ -1,10 +1,11 @@
 """Import and export of episodes and recordings: LeRobot, MCAP, UMI and Rerun formats."""
 
 __all__ = [
-    "foreign",
-    "foreign_mcap",
-    "foreign_rerun",
+    "formats",
     "foxglove",
+    "import_mcap",
+    "import_recording",
+    "import_rerun",
     "lerobot",
     "mcap",
     "rerun",

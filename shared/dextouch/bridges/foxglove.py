@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from dextouch.bridges.exporting import new_file, touch_side
+from dextouch.bridges.export_files import new_file, touch_side
 from dextouch.bridges.mcap_messages import ACTION, ACTIONS, MessageCodec, joint_names
 from dextouch.streams import HEAD_CAMERA, StreamDescriptor
 

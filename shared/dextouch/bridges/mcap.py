@@ -22,7 +22,7 @@ from mcap.writer import CompressionType, Writer
 from pydantic import ValidationError
 
 from dextouch import __version__
-from dextouch.bridges.exporting import (
+from dextouch.bridges.export_files import (
     Block,
     Reader,
     TouchPictures,
@@ -32,7 +32,7 @@ from dextouch.bridges.exporting import (
     touch_side,
     wall_offset_ns,
 )
-from dextouch.bridges.foreign import MAGIC
+from dextouch.bridges.formats import FILE_SIGNATURES
 from dextouch.bridges.mcap_messages import (
     CALIBRATION,
     MessageCodec,
@@ -460,7 +460,7 @@ def records(path: Path) -> Iterator[McapRecord]:
     if not path.is_file():
         raise NotFoundError(f"{path}: no such file; expected an MCAP file")
     with disk_errors(f"read {path}"), path.open("rb") as file:
-        if file.read(len(MAGIC["mcap"])) != MAGIC["mcap"]:
+        if file.read(len(FILE_SIGNATURES["mcap"])) != FILE_SIGNATURES["mcap"]:
             raise InvalidInputError(f"{path}: is not an MCAP file (wrong magic bytes)")
         file.seek(0)
         try:

@@ -33,7 +33,7 @@ from google.protobuf.message import DecodeError
 from google.protobuf.message_factory import GetMessageClass
 from jaxtyping import Shaped
 
-from dextouch.bridges.exporting import SEQUENCE, T_DEVICE
+from dextouch.bridges.export_files import SEQUENCE, T_DEVICE
 from dextouch.errors import CorruptDataError
 from dextouch.geometry import DISTORTION_MODEL
 from dextouch.hands import actions as act

@@ -11,7 +11,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 from rerun.components import ImageFormat
 
-from dextouch.bridges.exporting import Block, Reader, TouchPictures, blocks, new_file, touch_side
+from dextouch.bridges.export_files import Block, Reader, TouchPictures, blocks, new_file, touch_side
 from dextouch.episodes import EpisodeReader, is_keyframe
 from dextouch.errors import InvalidInputError
 from dextouch.schemas import json_ready

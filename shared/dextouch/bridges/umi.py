@@ -11,7 +11,7 @@ import zarr
 from jaxtyping import Float64
 from zarr.core.common import JSON
 
-from dextouch.bridges.exporting import BLOCK_IMAGES, new_file
+from dextouch.bridges.export_files import BLOCK_IMAGES, new_file
 from dextouch.episodes import EpisodeReader, disk_errors
 from dextouch.errors import InvalidInputError
 from dextouch.geometry.rotations import vector_from_rotation

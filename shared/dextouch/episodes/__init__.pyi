@@ -1,10 +1,10 @@
-from . import care as care
 from . import editing as editing
+from . import maintenance as maintenance
 from . import needs as needs
 from . import spool as spool
 from .files import GroupFiles as GroupFiles
+from .files import GroupFingerprint as GroupFingerprint
 from .files import LocalGroup as LocalGroup
-from .files import Stamps as Stamps
 from .files import disk_errors as disk_errors
 from .files import folder_bytes as folder_bytes
 from .files import held_folder as held_folder
@@ -63,7 +63,7 @@ from .splits import scene_of as scene_of
 from .splits import split_by_scene as split_by_scene
 from .splits import split_of as split_of
 from .splits import split_of_scene as split_of_scene
-from .stages import DOWNLOADS as DOWNLOADS
+from .staging import DOWNLOADS as DOWNLOADS
 from .store import EpisodeStore as EpisodeStore
 from .store import local_folder as local_folder
 from .table import TRUE_ORIGINS as TRUE_ORIGINS

@@ -182,7 +182,7 @@ def folder_bytes(folder: Path) -> int:
     return total
 
 
-class Stamps(NamedTuple):
+class GroupFingerprint(NamedTuple):
     """What changes when a group is replaced or edited: its folder, its content and its remarks."""
 
     folder: int

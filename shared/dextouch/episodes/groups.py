@@ -364,7 +364,7 @@ class GroupReader(Generic[A]):
     def verify(self) -> Verification:
         """Read everything and compare it with the commit record, up to the first damage.
 
-        `dextouch.episodes.care` finds all damage, for `store verify` and `store repair`. Raises
+        `dextouch.episodes.maintenance` finds all damage, for `store verify` and `repair`. Raises
         CorruptDataError for the first damaged array, StorageError if the storage cannot be read.
         """
         contents = self._contents

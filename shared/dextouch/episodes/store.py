@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import unquote, urlsplit
 
+from dextouch.data_folder import is_bucket_url
 from dextouch.episodes.files import (
     GroupFiles,
+    GroupFingerprint,
     LocalGroup,
-    Stamps,
     disk_errors,
     folder_bytes,
     replace_file,
@@ -31,7 +32,7 @@ from dextouch.episodes.format import (
 )
 from dextouch.episodes.groups import A, GroupContents, read_group
 from dextouch.episodes.reader import EpisodeReader, RecordingReader
-from dextouch.episodes.stages import new_stage, sweep_stages
+from dextouch.episodes.staging import new_stage, sweep_stages
 from dextouch.episodes.trash import (
     CLICKS_FILE,
     NOTES_FILE,
@@ -69,10 +70,9 @@ from dextouch.schemas import (
 )
 
 if TYPE_CHECKING:
-    from dextouch.episodes.object_storage import ObjectStorage
+    from dextouch.episodes.bucket_storage import ObjectStorage
 
 
-_OBJECT_SCHEME = "s3://"
 _IS_ID = re.compile(ID_PATTERN).fullmatch
 
 
@@ -83,7 +83,7 @@ class EpisodeStore:
     ones are invisible.
 
     `url` is a local folder, `file:///…`, or `s3://bucket/prefix` with the options `endpoint`,
-    `region` and others of `dextouch.episodes.object_bucket` after a `?`; its credentials are
+    `region` and others of `dextouch.episodes.s3_bucket` after a `?`; its credentials are
     storage options, or in the usual AWS_* environment, which obstore reads. `root` is the local
     folder of unfinished groups: the store itself if that is a folder, otherwise the work folder.
     """
@@ -175,12 +175,14 @@ class EpisodeStore:
         """
         return self._storage.folder_numbers(_check_kind(kind))
 
-    def stamps(self, numbers: Mapping[str, int], *, kind: Kind = "episode") -> dict[str, Stamps]:
-        """Stamps of those of these ids that are committed; `numbers` are their folder's.
+    def fingerprints(
+        self, numbers: Mapping[str, int], *, kind: Kind = "episode"
+    ) -> dict[str, GroupFingerprint]:
+        """Fingerprints of those of these ids that are committed; `numbers` are their folder's.
 
         They change when the content or the remarks of an item are replaced, or edited by hand.
         """
-        return self._storage.stamps(_check_kind(kind), numbers)
+        return self._storage.fingerprints(_check_kind(kind), numbers)
 
     def review(self, item_id: str, *, kind: Kind = "episode") -> Review | None:
         """The review of an item; None if nobody reviewed it.
@@ -358,10 +360,10 @@ def _open_storage(
     url: str | Path, storage_options: Mapping[str, str]
 ) -> "_LocalStorage | ObjectStorage":
     """Storage backend for a URL; see `EpisodeStore` for the arguments."""
-    if isinstance(url, str) and url.startswith(_OBJECT_SCHEME):
+    if is_bucket_url(url):
         # Imported lazily, so that a local store does not need obstore.
         try:
-            from dextouch.episodes.object_storage import ObjectStorage
+            from dextouch.episodes.bucket_storage import ObjectStorage
         except ModuleNotFoundError as error:
             if error.name != "obstore":
                 raise
@@ -450,7 +452,7 @@ class _LocalStorage:
             except FileNotFoundError:
                 return {}
 
-    def stamps(self, kind: Kind, numbers: Mapping[str, int]) -> dict[str, Stamps]:
+    def fingerprints(self, kind: Kind, numbers: Mapping[str, int]) -> dict[str, GroupFingerprint]:
         found, none = {}, " ".join([""] * len(REMARK_FILES))
         with disk_errors(f"look at {kind}s"):
             for name in filter(_IS_ID, numbers):
@@ -466,7 +468,7 @@ class _LocalStorage:
                     # Reading it says what is wrong.
                     commit, content, remarks = "?", "? ", none
                 if commit:
-                    found[name] = Stamps(numbers[name], content, remarks)
+                    found[name] = GroupFingerprint(numbers[name], content, remarks)
         return found
 
     def delete(self, kind: Kind, item_id: str) -> None:

@@ -48,7 +48,7 @@ from dextouch.episodes.image_codecs import (
     pack_group,
 )
 from dextouch.episodes.shards import ShardWriter
-from dextouch.episodes.stages import commit_stage, publish
+from dextouch.episodes.staging import commit_stage, publish
 from dextouch.errors import (
     ConflictError,
     InvalidInputError,

@@ -56,6 +56,7 @@ from .common import status_of as status_of
 from .episodes import ID_TAKEN as ID_TAKEN
 from .episodes import MAX_CAUSE as MAX_CAUSE
 from .episodes import MERGED as MERGED
+from .episodes import SHARED_ATTRIBUTES as SHARED_ATTRIBUTES
 from .episodes import BatchReceipt as BatchReceipt
 from .episodes import CatalogHours as CatalogHours
 from .episodes import ClockReport as ClockReport

@@ -27,6 +27,11 @@ from dextouch.schemas.common import (
 from dextouch.streams import StreamDescriptor
 
 FORMAT_VERSION: Final = 1
+# What a recording and the episodes made of it say under the same names.
+SHARED_ATTRIBUTES: Final = (
+    "task", "instruction", "domain", "station", "operator", "trace_id", "success", "recovered",
+    "complete", "incomplete_cause",
+)  # fmt: skip
 # Characters of the reason why a take is incomplete.
 MAX_CAUSE = 500
 # Characters of the parameters of an edit: room for two instructions, quoted.

@@ -11,3 +11,4 @@ from .world import State as State
 from .world import SteppedRollout as SteppedRollout
 from .world import World as World
 from .world import asked_cameras as asked_cameras
+from .world import check_chunk as check_chunk

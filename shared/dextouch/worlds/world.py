@@ -100,6 +100,7 @@ class World(Protocol[State]):
 
         Raises:
             InvalidInputError: wrong shape, NaN, infinity, or out of reach; nothing has changed.
+            LimitExceededError: more steps than `max_chunk_steps`, in a world model.
             EndedError: the world cannot continue from this state, for the given reason; the state
                 remains valid for `snapshot`.
         """

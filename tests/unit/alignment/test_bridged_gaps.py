@@ -7,7 +7,7 @@ from dextouch.episodes import EpisodeGrid, EpisodeStore
 from services.alignment.jobs import align_recording
 from services.alignment.settings import AlignmentOptions
 from services.alignment.synchronization.resampling import bridged_run, longest_run
-from services.world_model.training.dataset import StoredEpisode, window_starts
+from services.world_model.training.joint_dataset import StoredEpisode, window_starts
 from tests.unit.alignment import recordings
 
 SECONDS = 20.0

@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from dextouch.bridges.foreign import ImportAttributes
-from dextouch.bridges.foreign_mcap import import_any_mcap
+from dextouch.bridges.import_mcap import import_any_mcap
+from dextouch.bridges.import_recording import ImportAttributes
 from dextouch.episodes import EpisodeStore, needs
 from dextouch.geometry import transform_from_pose
 from dextouch.hands.actions import poses_from_actions
@@ -22,7 +22,7 @@ from services.episode_store.reading import (
     playback_of,
     reduce_signals,
 )
-from tests.unit.bridges.test_foreign_mcap import PIXELS, T0, Recorder, encoded
+from tests.unit.bridges.test_import_mcap import PIXELS, T0, Recorder, encoded
 from tests.unit.world_model.test_other_gloves import LAYOUT
 
 SECONDS = 4.0

@@ -12,7 +12,7 @@ import pyarrow.parquet as pq
 import pytest
 import yaml
 
-from dextouch.bridges import exporting as files
+from dextouch.bridges import export_files as files
 from dextouch.bridges.lerobot import (
     ExportOptions,
     export_dataset,
@@ -168,7 +168,7 @@ _OTHERS = ("data", "card", "sync", "removal")
 CRASH = """
 import os, signal, sys
 from pathlib import Path
-from dextouch.bridges import exporting as files
+from dextouch.bridges import export_files as files
 from dextouch.bridges.lerobot import ExportOptions, export_dataset, exporting
 from dextouch.episodes import EpisodeStore
 root, where = Path(sys.argv[1]), sys.argv[2]

@@ -5,9 +5,9 @@ import pytest
 
 rr = pytest.importorskip("rerun", reason="rerun-sdk is not installed: pip install '.[rerun]'")
 
-from dextouch.bridges.exporting import heat_map  # noqa: E402
-from dextouch.bridges.foreign import ImportAttributes  # noqa: E402
-from dextouch.bridges.foreign_rerun import import_rrd  # noqa: E402
+from dextouch.bridges.export_files import heat_map  # noqa: E402
+from dextouch.bridges.import_recording import ImportAttributes  # noqa: E402
+from dextouch.bridges.import_rerun import import_rrd  # noqa: E402
 from dextouch.bridges.rerun import entity_of, export_rrd  # noqa: E402
 from dextouch.episodes import EpisodeStore  # noqa: E402
 from dextouch.errors import ConflictError, InvalidInputError  # noqa: E402

@@ -162,6 +162,7 @@ def test_the_table_shows_undefined_agreement(capsys):
             "agreement": {
                 "t": {
                     "pearson": "undefined",
+                    "kendall": "undefined",
                     "mmrv": 0.1,
                     "mmrv_paper": 0.0,
                     "num_policies": 5,

@@ -5,11 +5,12 @@ import pytest
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import InvalidInputError, NotFoundError, UnknownNameError
 from services.cli import main
+from services.evaluation.bundled_policies import BUNDLED, bundled_policy
 from services.evaluation.recorded_takes import REPLAY
 from services.pipelines import evaluate
 from services.pipelines.parsers import recorded_parser
 
-HOLD = "services.evaluation.policies.replay:HoldPolicy"
+HOLD = "services.evaluation.policies.open_loop:HoldPolicy"
 
 
 def policies(*words):
@@ -19,6 +20,13 @@ def policies(*words):
 
 def test_policies_have_the_names_that_they_are_given():
     assert list(policies("--policy", f"mine={HOLD}", "--hold")) == ["mine", "hold"]
+
+
+@pytest.mark.parametrize("name", BUNDLED)
+def test_every_built_in_policy_is_offered(name):
+    found = policies("--builtin", name, "--hold", "--builtin", "hold")
+    assert list(found) == list(dict.fromkeys([name, "hold"]))
+    assert type(found[name]) is type(bundled_policy(name))
 
 
 @pytest.mark.parametrize("name", ["hold", REPLAY])

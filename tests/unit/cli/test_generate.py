@@ -13,7 +13,7 @@ from services.twin.episodes import TakeOptions, record, write_episode
 from services.twin.settings import TwinSettings
 from services.twin.stage import Stage
 from services.world_model.checkpoints import write_state_checkpoint
-from services.world_model.training.dataset import load_episodes
+from services.world_model.training.joint_dataset import load_episodes
 from tests.contracts.test_world import untrained_state_checkpoint
 
 pytestmark = pytest.mark.long
@@ -87,9 +87,9 @@ def test_demonstrations_are_imagined_whole(generate, truth, tmp_path):
     assert source in page
     assert page.count("data:image/png") == 2 * 2 * 8
     # Once more: nothing is made anew.
-    stamps = target.stamps({made[0]: 0})
+    before = target.fingerprints({made[0]: 0})
     assert generate(seeds="4:5") == (0, made)
-    assert target.stamps({made[0]: 0}) == stamps
+    assert target.fingerprints({made[0]: 0}) == before
 
 
 def test_scenes_of_the_world_model_are_refused(generate, truth, capsys):

@@ -16,7 +16,7 @@ from websockets.sync.server import serve
 from dextouch.clients import OpenPiPolicy, PolicyStart
 from dextouch.errors import InvalidInputError, ShapeError, UnavailableError
 from dextouch.schemas import Observation
-from services.evaluation.policies.outside import PolicySource
+from services.evaluation.policies.user_policies import PolicySource
 from tests.unit.worlds import fakes
 from tests.unit.worlds.test_openpi import decoded, encoded
 

@@ -108,7 +108,7 @@ def test_what_did_not_change_is_not_looked_at(store, monkeypatch):
     os.utime(store.root / "episodes", ns=(long_ago_ns, long_ago_ns))
     assert ids(catalog) == "abcd"
     with monkeypatch.context() as patch:
-        for name in ("folder_numbers", "stamps", "open"):
+        for name in ("folder_numbers", "fingerprints", "open"):
             patch.setattr(store, name, None)
         assert ids(catalog, origin="twin") == "ab"
     store.delete("b")

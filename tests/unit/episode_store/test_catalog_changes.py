@@ -10,7 +10,7 @@ from pydantic import ValidationError
 from structlog.testing import capture_logs
 
 from dextouch.episodes import EpisodeStore
-from dextouch.episodes.care import DeletionRequest, delete_for_good
+from dextouch.episodes.maintenance import DeletionRequest, delete_for_good
 from dextouch.errors import StorageError
 from dextouch.schemas import Review
 from services.episode_store import catalog_index

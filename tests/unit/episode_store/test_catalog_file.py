@@ -15,11 +15,11 @@ import pytest
 from structlog.testing import capture_logs
 
 from dextouch.episodes import EpisodeStore
-from dextouch.episodes.care import DeletionRequest, delete_for_good
+from dextouch.episodes.maintenance import DeletionRequest, delete_for_good
 from dextouch.schemas import Review
 from services.episode_store import catalog_file, catalog_index, command_line
 from services.episode_store.catalog import Catalog
-from services.episode_store.filters import EpisodeFilter, ItemFilter
+from services.episode_store.filters import EQUALITY_FILTERS, Condition, EpisodeFilter, ItemFilter
 from tests.contracts.s3_server import CREDENTIALS, running_s3
 from tests.unit.episode_store.random_items import NOON, put_item
 
@@ -37,6 +37,16 @@ def store(settings):
 def ids(catalog, **wanted):
     found = catalog.episodes(EpisodeFilter(**wanted), limit=999)
     return [episode.episode_id for episode in found.episodes]
+
+
+def test_lists_are_counted_by_columns_of_the_counts_alone():
+    with closing(sqlite3.connect(":memory:")) as connection:
+        connection.executescript(catalog_file._SCHEMA)
+        columns = {row[1] for row in connection.execute("PRAGMA table_info(tally)")}
+    for name in EQUALITY_FILTERS:
+        where = Condition()
+        ItemFilter.model_construct(**{name: "x"}).restrict(where)
+        assert (where.terms, where.is_counted) == ([f"i.{name} = ?"], name in columns)
 
 
 def databases(store):
@@ -276,7 +286,7 @@ def test_a_deleted_operator_is_in_no_byte_of_it(store, tmp_path, is_open):
 
 
 def test_what_names_a_deleted_operator_is_searched_for(store, tmp_path, monkeypatch):
-    from dextouch.episodes.care import deletion
+    from dextouch.episodes.maintenance import deletion
 
     ids(Catalog(store))
     monkeypatch.setattr(deletion, "erase_from_catalog", lambda *_: None)

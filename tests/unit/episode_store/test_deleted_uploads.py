@@ -4,7 +4,7 @@ import pytest
 from structlog.testing import capture_logs
 
 from dextouch.episodes import EpisodeStore
-from dextouch.episodes.care import DeletionRecords, DeletionRequest, delete_for_good
+from dextouch.episodes.maintenance import DeletionRecords, DeletionRequest, delete_for_good
 from dextouch.errors import ConflictError, StorageError
 from dextouch.schemas import FinishRecording
 from dextouch.streams import encode_batch

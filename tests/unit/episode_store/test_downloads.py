@@ -18,7 +18,7 @@ pytest.importorskip("mcap", reason="mcap is not installed: pip install '.[export
 
 from dextouch.bridges.mcap import import_mcap
 from dextouch.episodes import EpisodeStore
-from dextouch.episodes.care import DeletionRequest, delete_for_good, inspect_unfinished
+from dextouch.episodes.maintenance import DeletionRequest, delete_for_good, inspect_unfinished
 from dextouch.installation import install_command
 from dextouch.schemas import Review
 from services.episode_store import downloads

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from dextouch.episodes import EpisodeStore, care
+from dextouch.episodes import EpisodeStore, maintenance
 from dextouch.schemas import MAX_NOTES, ItemNotes
 from services.cli.main import main
 from tests.unit.episode_store.episodes import write_episode, write_recording
@@ -118,8 +118,8 @@ def test_notes_are_added_listed_removed_and_go_with_the_item(run, store, tmp_pat
     assert len(store.notes("a").notes) == 2
     assert store.open("a").content_sha256 == sha256
     # A person's name goes, what was said stays.
-    request = care.DeletionRequest(operator="p-7")
-    receipt = care.delete_for_good(store.root, request, tmp_path / "receipt.json")
+    request = maintenance.DeletionRequest(operator="p-7")
+    receipt = maintenance.delete_for_good(store.root, request, tmp_path / "receipt.json")
     assert (receipt.deleted, receipt.complete) == ((), True)
     assert [(one.author, one.text) for one in store.notes("a").notes] == [
         (None, "earlier"),

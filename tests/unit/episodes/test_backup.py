@@ -9,9 +9,14 @@ from pathlib import Path
 import pytest
 
 from dextouch.episodes import EpisodeStore
-from dextouch.episodes.care import DeletionRecords, DeletionRequest, TakeFacts, delete_for_good
 from dextouch.episodes.editing import back_up, restore_backup
 from dextouch.episodes.editing.backup import read_backup_list
+from dextouch.episodes.maintenance import (
+    DeletionRecords,
+    DeletionRequest,
+    TakeFacts,
+    delete_for_good,
+)
 from dextouch.errors import (
     ConflictError,
     CorruptDataError,

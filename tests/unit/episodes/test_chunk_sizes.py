@@ -9,7 +9,6 @@ import zstandard
 from pydantic import ValidationError
 
 from dextouch.episodes import files, stages, stream_arrays
-from dextouch.episodes.care import inspect_group, repair_group
 from dextouch.episodes.files import MAX_METADATA_BYTES
 from dextouch.episodes.format import (
     CommitRecord,
@@ -19,6 +18,7 @@ from dextouch.episodes.format import (
     encode_commit,
     with_rows,
 )
+from dextouch.episodes.maintenance import inspect_group, repair_group
 from dextouch.episodes.shards import with_crc
 from dextouch.errors import CorruptDataError, StorageError
 from dextouch.schemas import RecordingAttributes

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dextouch.episodes import EpisodeStore, GopEncoder, VideoSettings, first_gap
-from dextouch.episodes.care import inspect_group, repair_group
+from dextouch.episodes.maintenance import inspect_group, repair_group
 from dextouch.errors import CorruptDataError, NotFoundError
 from dextouch.images import encode_jpeg
 from dextouch.schemas import RecordingAttributes

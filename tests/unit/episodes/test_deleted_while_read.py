@@ -11,7 +11,7 @@ import pytest
 
 from dextouch.episodes import EpisodeStore
 from dextouch.episodes import store as store_module
-from dextouch.episodes.care import inspect_group
+from dextouch.episodes.maintenance import inspect_group
 from dextouch.errors import CorruptDataError, NotFoundError, StorageError
 from dextouch.schemas import Review
 from tests.contracts.s3_server import CREDENTIALS, running_s3

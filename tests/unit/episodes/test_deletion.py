@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from dextouch.episodes import EpisodeStore
-from dextouch.episodes.care import (
+from dextouch.episodes.editing import MergeOptions, add_note, merge_stores, relabel_item
+from dextouch.episodes.maintenance import (
     DeletionRequest,
     delete_for_good,
     deletion,
@@ -18,7 +19,6 @@ from dextouch.episodes.care import (
     repair_group,
     reviews_by,
 )
-from dextouch.episodes.editing import MergeOptions, add_note, merge_stores, relabel_item
 from dextouch.episodes.spool import SpoolWriter
 from dextouch.errors import CorruptDataError, InvalidInputError, NotFoundError
 from dextouch.schemas import LineageEntry, NewNote, RecordingAttributes, Review

@@ -4,7 +4,7 @@ from datetime import UTC, datetime, timedelta
 
 import pytest
 
-from dextouch.episodes.care import DeletionRecords, TakeFacts, take_start
+from dextouch.episodes.maintenance import DeletionRecords, TakeFacts, take_start
 from dextouch.errors import ConflictError, CorruptDataError
 
 GONE = "Zoë-7"

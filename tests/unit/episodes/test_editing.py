@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from dextouch.episodes import (
     EpisodeGrid,
     EpisodeStore,
-    care,
     interpolated_spans,
     is_rejected,
+    maintenance,
 )
 from dextouch.episodes.editing import (
     EditOptions,
@@ -154,7 +154,7 @@ def test_a_trim_that_keeps_all_has_the_same_arrays(long_take):
 
 
 def arrays_of(store, name, kind="episode"):
-    contents = care.open_contents(store.files(name, kind=kind), kind)
+    contents = maintenance.open_contents(store.files(name, kind=kind), kind)
     return {array: (entry.sha256, entry.shape) for array, entry in contents.entries.items()}
 
 
@@ -352,7 +352,7 @@ def test_a_relabel_shares_the_arrays_and_changes_attributes(store):
     # They are apart for all that: what is left of one is whole.
     store.delete("a", for_good=True)
     store.open("b").verify()
-    assert not care.inspect_group(store.files("b"), "episode").damaged
+    assert not maintenance.inspect_group(store.files("b"), "episode").damaged
 
 
 def test_another_task_needs_an_outcome_and_drops_the_events(store):
@@ -385,8 +385,8 @@ def test_a_relabel_to_another_operator_is_another_one(store, tmp_path):
         assert store.recording(result.id).attributes.operator == operator
     assert len(store.list(kind="recording")) == 3
     write_recording(store, "other", operator="p-4")
-    request = care.DeletionRequest(operator="p-4")
-    care.delete_for_good(store.root, request, tmp_path / "receipt.json")
+    request = maintenance.DeletionRequest(operator="p-4")
+    maintenance.delete_for_good(store.root, request, tmp_path / "receipt.json")
     with pytest.raises(InvalidInputError, match="permanently deleted"):
         relabel_item(store, "take", {"operator": "p-4"}, kind="recording")
 
@@ -406,8 +406,8 @@ def test_an_edit_takes_only_the_files_of_arrays(store):
 def test_deleting_an_operator_deletes_what_was_relabelled_from_another(store, tmp_path):
     write_recording(store, "take", operator="p-1")
     relabel_item(store, "take", {"operator": "p-2"}, kind="recording")
-    request = care.DeletionRequest(operator="p-2")
-    receipt = care.delete_for_good(store.root, request, tmp_path / "receipt.json")
+    request = maintenance.DeletionRequest(operator="p-2")
+    receipt = maintenance.delete_for_good(store.root, request, tmp_path / "receipt.json")
     # The source shows the same person under a wrong pseudonym.
     assert {victim.id for victim in receipt.deleted} == {"take", "take-relabelled-1"}
     assert receipt.complete

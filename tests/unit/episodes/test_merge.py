@@ -4,7 +4,7 @@ from datetime import UTC, datetime
 
 import pytest
 
-from dextouch.episodes import EpisodeStore, care, is_rejected
+from dextouch.episodes import EpisodeStore, is_rejected, maintenance
 from dextouch.episodes.editing import (
     EditOptions,
     MergeOptions,
@@ -63,7 +63,7 @@ def test_items_come_over_byte_for_byte_with_what_people_said(stores):
     ours, theirs = (s.root / "episodes/take-aligned/action/c/0/0" for s in (target, one))
     assert not ours.samefile(theirs)
     for name in target.list():
-        assert not care.inspect_group(target.files(name), "episode").damaged
+        assert not maintenance.inspect_group(target.files(name), "episode").damaged
     assert {a for _, a, _ in outcomes(merge_stores([one, two], target, options=PLAIN))} == {"there"}
 
 
@@ -147,8 +147,8 @@ def test_a_merge_again_brings_back_nothing_that_was_edited_or_deleted(stores):
 def test_names_of_deleted_operators_do_not_come_back(stores, tmp_path):
     one, _, target = stores
     write_recording(target, "take", operator="p-7")
-    request = care.DeletionRequest(operator="p-7")
-    care.delete_for_good(target.root, request, tmp_path / "receipt.json")
+    request = maintenance.DeletionRequest(operator="p-7")
+    maintenance.delete_for_good(target.root, request, tmp_path / "receipt.json")
     write_episode(one, "a")
     one.set_review("a", REVIEW)
     mine = NOTES.notes[0].model_copy(update={"author": "p-7"})
@@ -195,8 +195,8 @@ def test_what_was_deleted_for_good_does_not_come_back(stores, tmp_path):
         write_take(store, "take", operator="p-1", station="bench")
     write_episode(two, "trained", operator="p-1")
     write_episode(two, "free", operator="p-2")
-    request = care.DeletionRequest(operator="p-1")
-    care.delete_for_good(target.root, request, tmp_path / "receipt.json")
+    request = maintenance.DeletionRequest(operator="p-1")
+    maintenance.delete_for_good(target.root, request, tmp_path / "receipt.json")
     reports = merge_stores([one, two], target, options=PLAIN)
     assert [report.action for report in reports] == ["refused", "refused", "copied", "refused"]
     assert "permanently deleted" in reports[0].reason
@@ -242,7 +242,7 @@ def check_bucket(one, bucket, target):
     relabelled = relabel_item(bucket, trimmed.id, {"instruction": "up"})
     assert set(bucket.list()) == {"a", trimmed.id, relabelled.id}
     for name in bucket.list():
-        assert not care.inspect_group(bucket.files(name), "episode").damaged
+        assert not maintenance.inspect_group(bucket.files(name), "episode").damaged
     merge_stores([bucket], target, options=PLAIN)
     assert target.open(relabelled.id).content_sha256 == relabelled.sha256
     assert target.review("a").superseded_by == (trimmed.id, relabelled.id)

@@ -5,7 +5,7 @@ import sys
 import pytest
 
 from dextouch.episodes import EpisodeStore
-from dextouch.episodes.object_bucket import ObjectOptions, parse_address
+from dextouch.episodes.s3_bucket import ObjectOptions, parse_address
 from dextouch.errors import (
     InvalidInputError,
     UnavailableError,

@@ -6,13 +6,13 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dextouch.episodes.object_bucket import Bucket, LruCache, ObjectFacts
-from dextouch.episodes.object_storage import (
+from dextouch.episodes.bucket_storage import (
     BLOCK_BYTES,
     MAX_READ_AHEAD,
     TAIL_BYTES,
     ObjectFile,
 )
+from dextouch.episodes.s3_bucket import Bucket, LruCache, ObjectFacts
 
 
 class CountedBucket(Bucket):

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from dextouch.episodes import GOP_IMAGES, EpisodeStore, LocalGroup
-from dextouch.episodes.care import inspect_group, repair_group
 from dextouch.episodes.format import CHUNK_SECONDS
+from dextouch.episodes.maintenance import inspect_group, repair_group
 from dextouch.errors import ConflictError, CorruptDataError
 from tests.unit.episodes.hostile_group import IMAGE_CHUNK, as_v2, flip, record_of, rows_of
 
@@ -265,7 +265,7 @@ def test_an_interrupted_repair_makes_no_second_copy(store, folder, truth, monkey
         raise KeyboardInterrupt
 
     damage_chunk(folder, TOUCH, 1)
-    monkeypatch.setattr("dextouch.episodes.care.repair.put_into_trash", die)
+    monkeypatch.setattr("dextouch.episodes.maintenance.repair.put_into_trash", die)
     with pytest.raises(KeyboardInterrupt):
         repair_group(store.root, "episode", ID)
     monkeypatch.undo()

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from dextouch.episodes import GopEncoder, VideoSettings
-from dextouch.episodes.care import inspect_upload, repair_uploads
+from dextouch.episodes.maintenance import inspect_upload, repair_uploads
 from dextouch.episodes.spool import SpoolWriter
 from dextouch.episodes.spool_log import HEADER_BYTES, LOG_FILE, LOG_MAGIC
 from dextouch.schemas import RecordingAttributes

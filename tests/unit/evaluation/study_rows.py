@@ -105,6 +105,10 @@ def pearson(task, world):
     return stats.pearsonr(*matched_rates(task, world)).statistic
 
 
+def kendall(task, world):
+    return stats.kendalltau(*matched_rates(task, world)).statistic
+
+
 def mmrv(task, world):
     """Li et al. 2024 by two loops, with the ties of SimplerEnv."""
     real, imagined = matched_rates(task, world)

@@ -44,8 +44,8 @@ def test_figures_of_draws_are_those_of_scipy():
         }
         for name, value in expected.items():
             assert found[name][row] == pytest.approx(value, abs=1e-9)
-        for name, figure in FIGURES.items():
-            single = figure(real=real[row], imagined=imagined[row])
+        for name, measure in FIGURES.items():
+            single = measure.compute(real=real[row], imagined=imagined[row])
             assert found[name][row] == pytest.approx(single, abs=1e-9)
 
 

@@ -14,8 +14,8 @@ from dextouch.worlds.baseline import CopyFirstWorld
 from services.evaluation.closed_loop import EvaluationPlan, RolloutRunner, evaluate, film
 from services.evaluation.matched_starts import StudyWorlds, WorldAddress, matched_start
 from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
-from services.evaluation.policies.replay import HoldPolicy
-from services.evaluation.rating.marks import Rubric
+from services.evaluation.policies.open_loop import HoldPolicy
+from services.evaluation.rating.rubrics import Rubric
 from services.evaluation.success_classifier import SuccessClassifier, Verdict
 from tests.unit.evaluation import toy
 from tests.unit.other_gloves import small_layout

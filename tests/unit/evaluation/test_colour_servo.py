@@ -14,7 +14,7 @@ from services.evaluation.policies.colour_servo import (
     thing_pixels,
     thing_place_m,
 )
-from services.evaluation.policies.outside import PolicySource
+from services.evaluation.policies.user_policies import PolicySource
 from services.twin.settings import TwinSettings
 from services.twin.world import TwinWorld
 

@@ -14,7 +14,7 @@ from services.evaluation.endings import read_ending_episodes
 from services.evaluation.matched_starts import refuse_training_starts, start_digest
 from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
 from services.evaluation.policies.cloning_training import read_cloning_episodes
-from services.evaluation.policies.replay import ReplayPolicy
+from services.evaluation.policies.open_loop import ReplayPolicy
 from services.evaluation.reporting.pictures import action_picture, episode_picture
 from services.evaluation.success_classifier import SuccessClassifier
 from tests.unit.evaluation import toy
@@ -100,6 +100,7 @@ def test_the_probe_can_be_trained_from_the_command_line(url, tmp_path, capsys):
     probe = SuccessClassifier.load(output)
     assert probe.metadata.settings["instructions"] == toy.INSTRUCTIONS
     assert json.loads(figures.read_text())["metrics"] == probe.metadata.metrics
+    assert probe.metadata.command.startswith("dextouch train judge --episodes ")
 
 
 @pytest.mark.long

@@ -9,7 +9,7 @@ import torch
 
 from dextouch.errors import InvalidInputError
 from dextouch.schemas import Observation, RolloutUncertainty, Uncertainty
-from services.evaluation.calibration import fit_combinations
+from services.evaluation.classifier_calibration import fit_combinations
 from services.evaluation.endings import Ending, EndingEpisode, milestones_of
 from services.evaluation.success_classifier import (
     Calibration,

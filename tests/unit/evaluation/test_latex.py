@@ -1,8 +1,8 @@
 """LaTeX tables, against a table written by hand."""
 
+from services.evaluation.rendering import escape_latex
 from services.evaluation.reporting.sections import latex_tables
 from services.evaluation.scores import ClosedLoopReport, RolloutScore
-from services.evaluation.templates import escape_latex
 
 # Three policies, four starts, two imagined worlds: rates 1, 0, .5 | .75, .25, .5 | .5, .5, .5.
 MARKS = {
@@ -45,18 +45,21 @@ def test_rates_by_hand():
         r"\bottomrule",
     ]
     rows = agreement.splitlines()
-    assert rows[5].startswith(r"\multirow{3}{*}{WM-Robot} & Pearson & 1.000 {\scriptsize [")
+    assert rows[5].startswith(r"\multirow{4}{*}{WM-Robot} & Pearson & 1.000 {\scriptsize [")
+    # WM-Robot ranks the policies as the real world does.
+    assert rows[6].startswith(r" & Kendall & 1.000 {\scriptsize [")
     # Equal rates in the imagined world: no correlation, and a tie that the paper's rule misses.
-    assert rows[9] == r"\multirow{3}{*}{WM-Mix} & Pearson & -- \\"
+    assert rows[10] == r"\multirow{4}{*}{WM-Mix} & Pearson & -- \\"
+    assert rows[11] == r" & Kendall & -- \\"
     # MMRV: a tie hides that the first is 1 above the second and the third 0.5: (1 + 0 + 0.5) / 3.
-    assert rows[10].startswith(r" & MMRV & 0.500")
-    assert rows[11].startswith(r" & MMRV (paper) & 0.000")
+    assert rows[12].startswith(r" & MMRV, ties counted & 0.500")
+    assert rows[13].startswith(r" & MMRV, paper's rule & 0.000")
 
 
 def test_two_policies_have_no_correlation():
     two = {world: dict(list(marks.items())[:2]) for world, marks in MARKS.items()}
     rows = latex_tables(report(two)).split("\\end{tabular}\n")[1].splitlines()
-    assert rows[5] == r"\multirow{3}{*}{WM-Robot} & Pearson & undefined (2 policies) \\"
+    assert rows[5] == r"\multirow{4}{*}{WM-Robot} & Pearson & undefined (2 policies) \\"
 
 
 def test_a_real_world_alone_has_one_table():

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from dextouch.errors import InvalidInputError, UnknownNameError
-from services.evaluation.rating.marks import Rubric, read_rubrics, rubric_of
 from services.evaluation.rating.rating_report import (
     intraclass_correlation,
     krippendorff_alpha,
     rater_biases,
 )
+from services.evaluation.rating.rubrics import Rubric, read_rubrics, rubric_of
 from services.twin.tasks import TASK_NAMES, get_task
 
 nan = np.nan

@@ -7,18 +7,10 @@ import pytest
 from pydantic import ValidationError
 
 from dextouch.errors import ConflictError, NotFoundError, StorageError
-from services.evaluation.rating.marks import (
-    DECIDING,
-    FIRST,
-    REPEAT,
-    Mark,
-    MarkLog,
-    by_people,
-    read_rubrics,
-    vote,
-)
+from services.evaluation.rating.marks import DECIDING, FIRST, REPEAT, Mark, MarkLog, by_people, vote
 from services.evaluation.rating.rating_queue import Assignment, RatedRollout, RatingQueue, token_of
 from services.evaluation.rating.rating_report import rating_report
+from services.evaluation.rating.rubrics import read_rubrics
 
 IDS = [f"rollout-{number}" for number in range(12)]
 

@@ -11,7 +11,7 @@ from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
 from dextouch.images import scaled_square
 from dextouch.worlds import WorldServiceSettings, create_world_app
 from services.evaluation.matched_starts import WorldAddress, start_digest
-from services.evaluation.policies.replay import HoldPolicy
+from services.evaluation.policies.open_loop import HoldPolicy
 from services.evaluation.recorded_takes import (
     REPLAY,
     RecordedScores,

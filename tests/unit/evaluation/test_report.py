@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from dextouch import __version__
+from services.evaluation.rendering import figure
 from services.evaluation.reporting import pictures, write_report
 from services.evaluation.reporting.pictures import (
     ActionPicture,
@@ -27,7 +28,6 @@ from services.evaluation.reporting.pictures import (
     ticks,
 )
 from services.evaluation.reporting.sections import clock_rows, error_rows, tiles
-from services.evaluation.templates import figure
 
 rng = np.random.default_rng(11)
 TIMES = np.linspace(0, 5, 4)

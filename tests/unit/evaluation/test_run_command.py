@@ -49,7 +49,7 @@ def test_a_study_without_a_single_imagined_ending_is_reported(
     assert re.fullmatch(r"reach +hold +[01]\.[05]+ of 2 +undefined of 0", row)
     assert "hold in dream, 2 x: stuck: this world imagines nothing" in shown.err
     comment = "No start was completed in both worlds (real and dream) by every policy"
-    assert "Pearson undefined, MMRV undefined" in shown.out
+    assert "Pearson undefined, Kendall undefined, MMRV undefined" in shown.out
     assert comment in shown.out
     report = json.loads((tmp_path / "report.json").read_text())
     assert report["agreement"]["reach"]["mmrv_paper"] == "undefined"

@@ -5,7 +5,7 @@ import pytest
 
 from dextouch.clients import Policy, PolicyStart
 from dextouch.errors import InvalidInputError, NonFiniteError, NotFoundError
-from services.evaluation.policies.replay import HoldPolicy, ReplayPolicy
+from services.evaluation.policies.open_loop import HoldPolicy, ReplayPolicy
 from tests.unit.evaluation import toy
 
 

@@ -17,9 +17,9 @@ from services.evaluation.closed_loop import EvaluationPlan, begin_matched, evalu
 from services.evaluation.endings import read_ending_episode
 from services.evaluation.matched_starts import StudyWorlds, WorldAddress
 from services.evaluation.policies.colour_servo import ColourServo
-from services.evaluation.policies.replay import HoldPolicy
-from services.evaluation.rating.marks import Rubric
+from services.evaluation.policies.open_loop import HoldPolicy
 from services.evaluation.rating.rating_queue import rated_rollouts, state_scores
+from services.evaluation.rating.rubrics import Rubric
 from services.evaluation.scores import ClosedLoopReport, RolloutFailure, RolloutScore
 from services.evaluation.studies.engine import PolicyFactory, StudyParts, run_study
 from services.evaluation.studies.results import (

@@ -19,6 +19,7 @@ from tests.unit.evaluation.study_rows import (
     counted,
     disagreements,
     interval,
+    kendall,
     lines,
     mmrv,
     pearson,
@@ -86,6 +87,7 @@ async def test_agreement_is_that_of_scipy_and_two_loops(root):
         for world in WORLDS[1:]:
             one = agreement[task, world]
             assert one["figures"]["pearson"] == pytest.approx(pearson(task, world))
+            assert one["figures"]["kendall"] == pytest.approx(kendall(task, world))
             assert one["figures"]["mmrv"] == pytest.approx(mmrv(task, world))
             low, high = one["intervals"]["mmrv"]
             assert 0 <= low <= high <= 1

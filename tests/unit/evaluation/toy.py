@@ -19,7 +19,7 @@ from dextouch.worlds.world import (
 )
 from services.evaluation.matched_starts import start_digest
 from services.evaluation.policies.cloning_training import DECISION_STRIDE, CloningEpisode, Moment
-from services.evaluation.policies.replay import ReplayPolicy
+from services.evaluation.policies.open_loop import ReplayPolicy
 
 SIZE = 32
 STEPS = 81

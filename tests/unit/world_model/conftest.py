@@ -24,9 +24,9 @@ from services.world_model.checkpoints import (
 from services.world_model.network.configuration import NetworkConfig
 from services.world_model.network.model import JointWorldModel
 from services.world_model.paper_settings import OptimizerSettings, TrainSettings, WindowSettings
-from services.world_model.training.dataset import EpisodeArrays, WindowSampler
 from services.world_model.training.distribution import ALONE
-from services.world_model.training.objective import LossOptions, errors, examples_of
+from services.world_model.training.joint_dataset import EpisodeArrays, WindowSampler
+from services.world_model.training.joint_objective import LossOptions, errors, examples_of
 
 PX = 32
 K_HEAD = pinhole_matrix(width_px=PX, height_px=PX, fovy_rad=np.deg2rad(60))

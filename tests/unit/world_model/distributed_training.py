@@ -8,7 +8,7 @@ from pathlib import Path
 
 from services.world_model.paper_settings import TrainSettings
 from services.world_model.training.distribution import joined_processes
-from services.world_model.training.trainer import TrainingProgress, train
+from services.world_model.training.joint_trainer import TrainingProgress, train
 
 
 def main(settings: Path, log: Path, killed_rank: int) -> None:

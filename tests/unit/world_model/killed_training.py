@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 from services.world_model.paper_settings import TrainSettings
-from services.world_model.training.trainer import TrainingProgress, train
+from services.world_model.training.joint_trainer import TrainingProgress, train
 
 
 def die(progress: TrainingProgress) -> None:

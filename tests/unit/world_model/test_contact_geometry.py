@@ -11,6 +11,7 @@ from dextouch.geometry import apply, invert, transform_from_pose
 from dextouch.streams import HEAD_CAMERA
 from services.world_model.checkpoints import read_checkpoint, write_checkpoint
 from services.world_model.dynamics.features import NEAR_M, hand_motion
+from services.world_model.joint_world import JointWorld
 from services.world_model.network.inputs import (
     GEOMETRY_SIZE,
     ObjectsAtStart,
@@ -18,15 +19,14 @@ from services.world_model.network.inputs import (
     contact_geometry,
 )
 from services.world_model.network.model import JointWorldModel, stack_noise
-from services.world_model.starts import SceneReader
-from services.world_model.training.dataset import WindowPosition, WindowSampler
+from services.world_model.predicted_world import SceneReader
 from services.world_model.training.distribution import Processes
-from services.world_model.training.objective import own_context
-from services.world_model.world import ModelWorld
+from services.world_model.training.joint_dataset import WindowPosition, WindowSampler
+from services.world_model.training.joint_objective import own_context
 from tests.contracts.test_world import untrained_state_checkpoint
 from tests.unit.other_gloves import small_layout
 from tests.unit.world_model.conftest import make_metadata
-from tests.unit.world_model.test_world import make_start
+from tests.unit.world_model.test_joint_world import make_start
 
 PER_POINT, POINTS = 7, 11
 
@@ -125,17 +125,17 @@ def reader():
 def test_a_served_model_needs_start_readers_of_its_tasks(checkpoint):
     for reader in (None, SceneReader(untrained_state_checkpoint())):
         with pytest.raises(InvalidInputError, match="--objects"):
-            ModelWorld(checkpoint, reader=reader)
+            JointWorld(checkpoint, reader=reader)
 
 
 def test_start_readers_of_another_glove_are_refused(checkpoint, reader):
     reader.tactile_layout = small_layout()
     with pytest.raises(InvalidInputError, match=r"'small' .138.*'dextouch_v1' .320.*--objects"):
-        ModelWorld(checkpoint, reader=reader)
+        JointWorld(checkpoint, reader=reader)
 
 
 def test_a_rollout_reads_the_objects_of_every_chunk(checkpoint, reader, toy_episode, monkeypatch):
-    world, asked = ModelWorld(checkpoint, reader=reader), []
+    world, asked = JointWorld(checkpoint, reader=reader), []
     read = reader.objects
 
     def objects(requests, tasks):

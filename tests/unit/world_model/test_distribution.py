@@ -13,10 +13,10 @@ from torch.distributed.device_mesh import init_device_mesh
 
 from dextouch.errors import ConflictError, InvalidInputError
 from services.world_model.checkpoints import read_checkpoint
-from services.world_model.training.dataset import WindowPosition, stack_windows
 from services.world_model.training.distribution import Processes
-from services.world_model.training.trainer import TrainingRun, train, train_on
-from services.world_model.training.training_state import StateFiles, state_path
+from services.world_model.training.joint_dataset import WindowPosition, stack_windows
+from services.world_model.training.joint_trainer import TrainingRun, train, train_on
+from services.world_model.training.resume_files import StateFiles, state_path
 from tests.unit.world_model.conftest import losses
 
 CHILD = Path(__file__).with_name("distributed_training.py")

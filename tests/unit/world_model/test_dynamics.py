@@ -42,7 +42,7 @@ from services.world_model.dynamics.model import (
     memory_of,
 )
 from services.world_model.dynamics.start_reader import FirstStep, ray_at_height
-from services.world_model.dynamics.trees import mapped, stacked
+from services.world_model.dynamics.tensor_trees import mapped, stacked
 
 CONFIG = DynamicsConfig(tasks=("one", "two"), num_objects=(1, 2), image_px=32, width=16)
 

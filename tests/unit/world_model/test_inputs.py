@@ -27,7 +27,7 @@ from services.world_model.network.conditioning import ActionNormalizer, SceneEnc
 from services.world_model.network.configuration import NetworkConfig
 from services.world_model.network.inputs import blots, build_inputs, pose_raster
 from services.world_model.network.instruction import NO_WORD, instruction_ids
-from services.world_model.training.dataset import WindowPosition
+from services.world_model.training.joint_dataset import WindowPosition
 
 # The rotation columns of both wrists and the head camera in a 67-D action.
 POSE_COLUMNS = np.array([[*range(3, 9)], [*range(12, 18)], [*range(61, 67)]])

@@ -19,9 +19,9 @@ from services.world_model.paper_settings import (
     TrainSettings,
     command_line,
 )
-from services.world_model.training.dataset import WindowSampler
 from services.world_model.training.episode_sets import check_tasks, load_split, subset_by_hash
-from services.world_model.training.trainer import train
+from services.world_model.training.joint_dataset import WindowSampler
+from services.world_model.training.joint_trainer import train
 from tests.unit.world_model.conftest import PX, human_episode, make_episode, write_episode
 
 

@@ -9,7 +9,7 @@ from services.world_model.network.attention import clean_mask
 from services.world_model.network.configuration import NetworkConfig
 from services.world_model.network.inputs import build_inputs
 from services.world_model.network.model import JointLatents, JointWorldModel, stack_noise
-from services.world_model.training.dataset import WindowPosition
+from services.world_model.training.joint_dataset import WindowPosition
 
 
 def _generator(seed):

@@ -16,8 +16,8 @@ from services.world_model.network.flow_matching import sample
 from services.world_model.network.inputs import build_inputs
 from services.world_model.network.instruction import NO_WORD, instruction_ids
 from services.world_model.network.model import JointLatents, JointWorldModel, Sampling, stack_noise
-from services.world_model.training.dataset import WindowSampler
-from services.world_model.training.objective import LossOptions, contact_or_changing
+from services.world_model.training.joint_dataset import WindowSampler
+from services.world_model.training.joint_objective import LossOptions, contact_or_changing
 from services.world_model.world import open_world
 from tests.unit.world_model.conftest import losses
 

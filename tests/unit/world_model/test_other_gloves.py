@@ -20,10 +20,10 @@ from services.world_model.network.configuration import NetworkConfig
 from services.world_model.network.tactile import build_tokenizer, canvas_cells
 from services.world_model.paper_settings import TrainTokenizerSettings
 from services.world_model.settings import CoreSettings, ReaderSettings, StateTrainSettings
+from services.world_model.training.joint_trainer import train_on
 from services.world_model.training.state_data import StateData, configured, load_scene_episodes
 from services.world_model.training.state_trainer import train_state
 from services.world_model.training.tokenizer_trainer import train_tokenizer
-from services.world_model.training.trainer import train_on
 from services.world_model.world import open_world
 from tests.unit.other_gloves import small_layout
 from tests.unit.world_model.conftest import make_episode, write_episode

@@ -8,18 +8,18 @@ import torch
 
 from services.world_model.checkpoints import read_checkpoint
 from services.world_model.command_line import run_distill
+from services.world_model.joint_world import JointWorld
 from services.world_model.network.inputs import build_inputs
 from services.world_model.network.model import JointLatents
-from services.world_model.training import objective
-from services.world_model.training.dataset import WindowPosition, WindowSampler, stack_windows
+from services.world_model.training import joint_objective
 from services.world_model.training.distribution import Processes
-from services.world_model.training.objective import LossOptions, own_context, own_noisy
-from services.world_model.training.trainer import train, train_on
-from services.world_model.world import ModelWorld
+from services.world_model.training.joint_dataset import WindowPosition, WindowSampler, stack_windows
+from services.world_model.training.joint_objective import LossOptions, own_context, own_noisy
+from services.world_model.training.joint_trainer import train, train_on
 from tests.unit.world_model.conftest import losses
+from tests.unit.world_model.test_joint_world import make_start
 from tests.unit.world_model.test_options import model_with
-from tests.unit.world_model.test_training_state import assert_same_run
-from tests.unit.world_model.test_world import make_start
+from tests.unit.world_model.test_resume_files import assert_same_run
 
 
 def generator():
@@ -40,13 +40,13 @@ def batch(toy_episodes):
 def test_the_second_chunk_begins_like_that_of_a_served_rollout(
     checkpoint, batch, toy_episodes, monkeypatch
 ):
-    monkeypatch.setattr(objective, "OWN_CONTEXT_SHARE", 1.0)
+    monkeypatch.setattr(joint_objective, "OWN_CONTEXT_SHARE", 1.0)
     # Not measured: step 3 of the first chunk, and step 4 of the second, of one hand each.
     batch.tactile_valid[1, 3, 1] = batch.tactile_valid[2, 16 + 4, 0] = False
     seconds = own_context(checkpoint.model, batch, generator=generator(), processes=Processes())
     assert (~seconds.tactile_valid).nonzero().tolist() == [[2, 4, 0]]
     assert seconds.tactile_valid.shape == (3, 17, 2)
-    world = ModelWorld(checkpoint)
+    world = JointWorld(checkpoint)
     for index, (given, made) in enumerate(zip(batch.requests, seconds.requests, strict=True)):
         start = make_start(toy_episodes[index], 2 * index)
         state = world.reset(start).state
@@ -65,7 +65,7 @@ def test_the_second_chunk_begins_like_that_of_a_served_rollout(
         np.testing.assert_allclose(*anchors, atol=1e-9)
         assert np.array_equal(seconds.images[index, 1:], truth.images[1:])
         assert np.array_equal(seconds.tactile_kpa[index, 1:], truth.tactile_kpa[1:])
-    monkeypatch.setattr(objective, "OWN_CONTEXT_SHARE", 0.0)
+    monkeypatch.setattr(joint_objective, "OWN_CONTEXT_SHARE", 0.0)
     firsts = own_context(checkpoint.model, batch, generator=generator(), processes=Processes())
     assert torch.equal(firsts.images, batch.images[:, :17])
     assert np.array_equal(firsts.requests[1].actions, batch.requests[1].actions[:17])

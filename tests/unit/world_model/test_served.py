@@ -10,16 +10,16 @@ from httpx import ASGITransport, AsyncClient
 from dextouch.schemas import StartRequest, decode_answer, encode_start
 from dextouch.worlds import create_world_app
 from services.world_model.command_line import open_by_digest
+from services.world_model.joint_world import JointWorld
 from services.world_model.settings import PAPER_FORM, PRETRAINED, STATE_MODEL, WorldModelSettings
-from services.world_model.world import ModelWorld
-from tests.unit.world_model.test_world import make_start
+from tests.unit.world_model.test_joint_world import make_start
 
 FLOAT64 = {"content-type": "application/octet-stream; dtype=float64"}
 
 
 @pytest.fixture
 async def client(checkpoint):
-    world = ModelWorld(checkpoint)
+    world = JointWorld(checkpoint)
     app = create_world_app({"tiny": world}, WorldModelSettings(), name="world_model")
     transport = ASGITransport(app, raise_app_exceptions=False)
     async with (

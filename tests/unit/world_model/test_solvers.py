@@ -8,10 +8,11 @@ import torch
 from scipy.integrate import solve_ivp
 
 from dextouch.errors import InvalidInputError
+from services.world_model.joint_world import JointWorld
 from services.world_model.network.flow_matching import SOLVERS, sample
 from services.world_model.network.model import Sampling
-from services.world_model.world import ModelWorld, open_world
-from tests.unit.world_model.test_world import make_start
+from services.world_model.world import open_world
+from tests.unit.world_model.test_joint_world import make_start
 
 MEANS, DEVIATIONS, WEIGHTS = np.array([-2.0, 0.5, 3.0]), np.array([0.5, 0.3, 0.8]), [0.3, 0.5, 0.2]
 
@@ -107,7 +108,7 @@ def test_a_world_samples_as_it_is_asked_to(checkpoint, toy_episode, tmp_path):
     chunk = episode.actions["commanded"][1:17]
 
     def touch(*sampling):
-        world = ModelWorld(checkpoint, sampling=Sampling(*sampling))
+        world = JointWorld(checkpoint, sampling=Sampling(*sampling))
         state = world.reset(make_start(episode)).state
         return world.step(state, chunk, seed=0).observation.tactile_kpa
 

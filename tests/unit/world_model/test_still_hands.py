@@ -11,7 +11,7 @@ from dextouch.hands.actions import CAMERA_HEAD
 from dextouch.schemas import ReturnSelector
 from dextouch.streams import HEAD_CAMERA
 from dextouch.worlds.world import first_chunk_s
-from tests.unit.world_model.test_world import make_start, world
+from tests.unit.world_model.test_joint_world import make_start, world
 
 __all__ = ["world"]
 

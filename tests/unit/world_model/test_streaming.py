@@ -12,7 +12,8 @@ from dextouch.episodes import EpisodeReader, EpisodeStore
 from dextouch.errors import InvalidInputError, NotFoundError
 from services.world_model.checkpoints import read_checkpoint
 from services.world_model.command_line import run_train
-from services.world_model.training.dataset import (
+from services.world_model.training.episode_sets import load_split
+from services.world_model.training.joint_dataset import (
     WindowPosition,
     WindowSampler,
     index_episodes,
@@ -20,8 +21,7 @@ from services.world_model.training.dataset import (
     read_batches,
     read_episode,
 )
-from services.world_model.training.episode_sets import load_split
-from services.world_model.training.trainer import TrainingRun, train
+from services.world_model.training.joint_trainer import TrainingRun, train
 from tests.unit.world_model.conftest import write_episode
 
 PLACES = [

@@ -19,7 +19,7 @@ from services.world_model.network.model import (
 )
 from services.world_model.network.tactile import build_tokenizer
 from services.world_model.settings import paper_form_checkpoint
-from services.world_model.training.dataset import WindowPosition, WindowSampler
+from services.world_model.training.joint_dataset import WindowPosition, WindowSampler
 from tests.unit.world_model.conftest import losses
 
 FORMS = [("principal_axes", "hand", 1), ("grid", "hand", 1), ("split_hands", "hand", 1),

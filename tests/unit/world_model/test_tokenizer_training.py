@@ -11,6 +11,7 @@ from services.world_model.network.configuration import NetworkConfig
 from services.world_model.network.tactile import build_tokenizer
 from services.world_model.paper_settings import TrainTokenizerSettings
 from services.world_model.training.episode_sets import load_split
+from services.world_model.training.joint_trainer import train_on
 from services.world_model.training.tokenizer_trainer import (
     TactileHands,
     load_hands,
@@ -18,7 +19,6 @@ from services.world_model.training.tokenizer_trainer import (
     reconstruction_loss,
     train_tokenizer,
 )
-from services.world_model.training.trainer import train_on
 
 
 @pytest.fixture

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from dextouch.schemas import MAX_OBJECTS
-from services.world_model.dynamics import trees
+from services.world_model.dynamics import tensor_trees
 from services.world_model.dynamics.core import NUM_PADS, CoreState, SceneStart
 from services.world_model.dynamics.features import (
     SAMPLE_OFFSETS,
@@ -13,7 +13,7 @@ from services.world_model.dynamics.features import (
     ObjectPoses,
 )
 from services.world_model.dynamics.model import DynamicsModel
-from services.world_model.dynamics.trees import Traced
+from services.world_model.dynamics.tensor_trees import Traced
 from services.world_model.state_world import StateWorld
 from tests.contracts.test_world import untrained_state_checkpoint
 
@@ -66,7 +66,7 @@ def inputs(model, seed, *, batch=1, latents=4, task=0):
 
 
 def tensors(outputs):
-    return list(trees._tensors(outputs))
+    return list(tensor_trees._tensors(outputs))
 
 
 @pytest.mark.long
@@ -95,7 +95,7 @@ def test_rare_shapes_and_too_many_of_them_are_not_traced(model, monkeypatch):
     assert not traced._traces
     traced(*inputs(model, 0))
     assert len(traced._traces) == 1
-    monkeypatch.setattr(trees, "_MOST_TRACES", 1)
+    monkeypatch.setattr(tensor_trees, "_MOST_TRACES", 1)
     for _ in range(6):
         traced(*inputs(model, 0, batch=2))
     assert len(traced._traces) == 1

@@ -16,25 +16,25 @@ from dextouch.hands.actions import CAMERA_HEAD, reanchor
 from dextouch.schemas import ReturnSelector, StartRequest, decode_answer, encode_start
 from dextouch.worlds import create_world_app
 from services.world_model.checkpoints import read_checkpoint, write_checkpoint
+from services.world_model.joint_world import JointWorld
 from services.world_model.network.inputs import MAX_KEPT, PastRule, build_inputs
 from services.world_model.network.model import JointWorldModel, Sampling
 from services.world_model.paper_settings import WindowSettings
 from services.world_model.plan import plan_of
 from services.world_model.pretrained_video import load_pretrained
 from services.world_model.settings import WorldModelSettings
-from services.world_model.training import trainer
-from services.world_model.training.dataset import (
+from services.world_model.training import joint_trainer
+from services.world_model.training.joint_dataset import (
     WindowPosition,
     WindowSampler,
     index_episodes,
     load_episodes,
     stack_windows,
 )
-from services.world_model.training.objective import errors, examples_of
-from services.world_model.world import ModelWorld
+from services.world_model.training.joint_objective import errors, examples_of
 from tests.unit.world_model.conftest import make_episode, make_metadata, write_episode
 from tests.unit.world_model.test_clean_tokens import noise_of
-from tests.unit.world_model.test_world import make_start
+from tests.unit.world_model.test_joint_world import make_start
 from tests.unit.world_model.wan.conftest import (
     autoencoder,
     enlarged,
@@ -217,7 +217,7 @@ def world(tiny_config, tmp_path):
     path = tmp_path / "seeing.safetensors"
     metadata = make_metadata(config).model_copy(update={"view_dropout": 0.1})
     write_checkpoint(path, model, metadata)
-    return ModelWorld(read_checkpoint(path))
+    return JointWorld(read_checkpoint(path))
 
 
 def start_of(episode, *cameras):
@@ -358,7 +358,7 @@ def test_without_the_options_nothing_is_new(checkpoint, toy_episode):
     names = {"further_views", "past_images", "past_choice", "past_stride", "view_dropout"}
     assert not names & {*metadata, *metadata["network"]}
     assert not [n for n in checkpoint.model.state_dict() if "views" in n or "past" in n]
-    world = ModelWorld(checkpoint)
+    world = JointWorld(checkpoint)
     assert "optional_cameras" not in world.description.model_dump()
     episode = with_wrists(toy_episode(1))
     state = world.reset(start_of(episode, LEFT)).state
@@ -409,24 +409,24 @@ def test_training_with_both_is_that_in_parts_and_can_be_resumed(
 ):
     config = tiny_config.model_copy(update=BOTH)
     given = train_settings.model_copy(update={"network": config, "max_steps": 3})
-    report = trainer.train(given)
+    report = joint_trainer.train(given)
     assert np.isfinite(report.metrics["psnr"])
     checkpoint = read_checkpoint(given.output)
     assert checkpoint.metadata.view_dropout == 0.1
     assert checkpoint.model.views.absent.abs().max() > 0
     parts = given.model_copy(update={"accumulate": 2, "output": tmp_path / "parts.safetensors"})
-    trainer.train(parts)
+    joint_trainer.train(parts)
     for name, weight in read_checkpoint(parts.output).model.state_dict().items():
         torch.testing.assert_close(
             weight, checkpoint.model.state_dict()[name], rtol=1e-3, atol=1e-4, msg=name
         )
     again = given.model_copy(update={"output": tmp_path / "again.safetensors"})
-    trainer.train(
+    joint_trainer.train(
         again.model_copy(update={"init": given.output, "new_tasks": False, "max_steps": 1})
     )
     other = given.model_copy(update={"init": given.output, "network": tiny_config})
     with pytest.raises(ConflictError, match="past_images"):
-        trainer.train(other)
+        joint_trainer.train(other)
 
 
 def test_episodes_without_a_needed_view_are_refused_by_name(stored, train_settings, tiny_config):
@@ -434,7 +434,7 @@ def test_episodes_without_a_needed_view_are_refused_by_name(stored, train_settin
     windows = WindowSettings(fit_windows=16, view_dropout=0.0)
     given = train_settings.model_copy(update={"network": config, "windows": windows})
     with pytest.raises(InvalidInputError, match=r"1 of 6 episodes.*wrist_right.*toy-5"):
-        trainer.train(given)
+        joint_trainer.train(given)
 
 
 def test_wrong_numbers_of_views_and_past_images_are_refused(model, episode):

@@ -16,7 +16,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from dextouch.bridges.exporting import BLOCK_IMAGES, replace_folder
+from dextouch.bridges.export_files import BLOCK_IMAGES, replace_folder
 from dextouch.bridges.lerobot import layout
 from dextouch.bridges.lerobot.appending import ExistingDataset
 from dextouch.bridges.lerobot.card import check_license, write_card

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int64
 from pydantic import ValidationError
 
-from dextouch.bridges.foreign import (
+from dextouch.bridges.import_recording import (
     MAX_ID,
     ForeignStream,
     ImageUnit,

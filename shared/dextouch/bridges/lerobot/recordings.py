@@ -13,8 +13,9 @@ import numpy as np
 from jaxtyping import Int64
 from pydantic import ValidationError
 
-from dextouch.bridges.exporting import BLOCK_IMAGES, Block
-from dextouch.bridges.foreign import (
+from dextouch.bridges.export_files import BLOCK_IMAGES, Block
+from dextouch.bridges.import_images import compressed_form, decode_png
+from dextouch.bridges.import_recording import (
     MAX_ID,
     ForeignStream,
     ImageUnit,
@@ -28,7 +29,6 @@ from dextouch.bridges.foreign import (
     stream_names,
     write_recording,
 )
-from dextouch.bridges.foreign_images import compressed_form, decode_png
 from dextouch.bridges.lerobot import layout
 from dextouch.bridges.lerobot.source import EpisodeEntry, FeatureInfo, LeRobotFolder, whole_text
 from dextouch.bridges.lerobot.video import read_images, read_units

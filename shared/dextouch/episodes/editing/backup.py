@@ -11,7 +11,7 @@ from typing import Final, Literal
 
 from pydantic import AwareDatetime, Base64Bytes, Field, ValidationError
 
-from dextouch.episodes import care
+from dextouch.episodes import maintenance
 from dextouch.episodes.editing.merge import copy_item, deletion_of
 from dextouch.episodes.files import LocalGroup, disk_errors, held_folder, replace_file
 from dextouch.episodes.format import COMMIT_FILE, KINDS, Kind, stated_sha256
@@ -126,11 +126,11 @@ def back_up(
         held, found = present | before.keys(), dict[tuple[Kind, str], str]()
         for kind in _ORDER:
             numbers = source.folder_numbers(kind=kind)
-            stamps = source.stamps(numbers, kind=kind)
+            stored = source.fingerprints(numbers, kind=kind)
             for name in numbers:
-                if name in stamps or (kind, name) in held:
-                    # Without a stamp its commit record was lost: it is damaged, not gone.
-                    found[kind, name] = " ".join(stamps[name][1:]) if name in stamps else ""
+                if name in stored or (kind, name) in held:
+                    # Without a fingerprint its commit record was lost: it is damaged, not gone.
+                    found[kind, name] = " ".join(stored[name][1:]) if name in stored else ""
         gone = held - found.keys()
         if 2 * len(gone) > len(held) and not accept_deletions:
             raise ConflictError(
@@ -197,7 +197,7 @@ def _restored(backup: EpisodeStore, target: EpisodeStore, kind: Kind, name: str)
     if not backup.exists(name, kind=kind):
         raise NotFoundError(f"{kind} {name!r}: the backup lacks it")
     reader = backup.open_item(kind, name)
-    covered = deletion_of(care.DeletionRecords(target.root), reader.attributes)
+    covered = deletion_of(maintenance.DeletionRecords(target.root), reader.attributes)
     if covered is not None and not covered.is_later:
         reason = f"it was permanently deleted on {covered.deleted_at:%Y-%m-%d}"
         return BackupReport(kind, name, "erased", reason)
@@ -252,7 +252,7 @@ class _Backup:
 
     def retire(self, gone: set[tuple[Kind, str]]) -> None:
         """Remove what the source lacks; what was permanently deleted there, from the trash, too."""
-        records = care.DeletionRecords(self.source.root)
+        records = maintenance.DeletionRecords(self.source.root)
         for kind, name in sorted(gone):
             self.target.delete(name, kind=kind)
             self._note(BackupReport(kind, name, "retired"))
@@ -261,12 +261,13 @@ class _Backup:
                 files = LocalGroup(entry.folder)
                 files.item_id = entry.item_id
                 with suppress(StorageError):
-                    if deletion_of(records, care.open_contents(files, entry.kind).attributes):
+                    contents = maintenance.open_contents(files, entry.kind)
+                    if deletion_of(records, contents.attributes):
                         remove_for_good(entry.folder)
                         self._note(BackupReport(entry.kind, entry.item_id, "erased"))
         if any(one.action == "erased" for one in self.reports):
             # A cache, which `store list` may have made here.
-            shutil.rmtree(self.target.root / care.CATALOG_FOLDER, ignore_errors=True)
+            shutil.rmtree(self.target.root / maintenance.CATALOG_FOLDER, ignore_errors=True)
 
     def _note(self, report: BackupReport, item: BackedUpItem | None = None) -> None:
         if item is not None:
@@ -282,8 +283,8 @@ def _content(store: EpisodeStore, kind: Kind, name: str) -> str | None:
     return stated_sha256(store.files(name, kind=kind).get_now(COMMIT_FILE))
 
 
-def _damage(store: EpisodeStore, kind: Kind, name: str) -> tuple[care.Finding, ...]:
-    return care.inspect_group(store.files(name, kind=kind), kind).findings
+def _damage(store: EpisodeStore, kind: Kind, name: str) -> tuple[maintenance.Finding, ...]:
+    return maintenance.inspect_group(store.files(name, kind=kind), kind).findings
 
 
 def _check_apart(source: EpisodeStore, target: EpisodeStore, command: str) -> None:

@@ -14,7 +14,6 @@ from functools import partial
 
 from pydantic import BaseModel, ValidationError
 
-from dextouch.episodes.care import DeletionRecords
 from dextouch.episodes.files import GroupFiles
 from dextouch.episodes.format import (
     ATTRIBUTES_KEY,
@@ -28,6 +27,7 @@ from dextouch.episodes.format import (
     numbered_ids,
     sha256_hex,
 )
+from dextouch.episodes.maintenance import DeletionRecords
 from dextouch.episodes.reader import EpisodeReader, RecordingReader
 from dextouch.episodes.store import EpisodeStore
 from dextouch.episodes.trash import CLICKS_FILE, NOTES_FILE, REVIEW_FILE

@@ -10,7 +10,6 @@ from typing import Literal
 
 from pydantic import BaseModel
 
-from dextouch.episodes.care import Covered, DeletionRecords, TakeFacts, open_contents
 from dextouch.episodes.editing.edits import with_attributes
 from dextouch.episodes.files import LocalGroup
 from dextouch.episodes.format import (
@@ -23,6 +22,7 @@ from dextouch.episodes.format import (
     kind_of,
     numbered_ids,
 )
+from dextouch.episodes.maintenance import Covered, DeletionRecords, TakeFacts, open_contents
 from dextouch.episodes.reader import EpisodeReader, RecordingReader
 from dextouch.episodes.store import EpisodeStore
 from dextouch.episodes.trash import CLICKS_FILE, NOTES_FILE, REVIEW_FILE, TRASH

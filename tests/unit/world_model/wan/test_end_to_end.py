@@ -22,8 +22,8 @@ from services.world_model.paper_settings import (
 from services.world_model.pretrained_video import initial_model
 from services.world_model.settings import Placement, WorldModelSettings
 from services.world_model.training.distribution import Processes
-from services.world_model.training.trainer import TrainingRun, train_on
-from tests.unit.world_model.test_world import make_start
+from services.world_model.training.joint_trainer import TrainingRun, train_on
+from tests.unit.world_model.test_joint_world import make_start
 
 INSTRUCTION = "push the box with both hands"
 

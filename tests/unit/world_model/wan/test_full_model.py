@@ -13,7 +13,7 @@ from services.world_model.network.configuration import NetworkConfig, WanConfig
 from services.world_model.network.inputs import build_inputs
 from services.world_model.network.model import JointWorldModel
 from services.world_model.pretrained_video import load_pretrained
-from services.world_model.training.dataset import WindowPosition
+from services.world_model.training.joint_dataset import WindowPosition
 from tests.unit.world_model.test_clean_tokens import assert_kept_tokens_change_nothing
 
 

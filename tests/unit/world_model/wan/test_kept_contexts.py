@@ -9,7 +9,7 @@ from services.world_model.network.inputs import build_inputs
 from services.world_model.network.instruction import LastUsed
 from services.world_model.network.model import JointWorldModel, Sampling
 from services.world_model.pretrained_video import load_pretrained
-from services.world_model.training.dataset import WindowPosition
+from services.world_model.training.joint_dataset import WindowPosition
 from tests.unit.world_model.test_clean_tokens import noise_of
 
 TEXTS = ("push the box", "stand", "push the box")

@@ -23,9 +23,9 @@ from services.world_model.plan import (
     training_table,
 )
 from services.world_model.pretrained_video import load_pretrained
-from services.world_model.training.dataset import WindowPosition
-from services.world_model.training.objective import errors, examples_of
-from services.world_model.training.trainer import TrainingRun
+from services.world_model.training.joint_dataset import WindowPosition
+from services.world_model.training.joint_objective import errors, examples_of
+from services.world_model.training.joint_trainer import TrainingRun
 from tests.unit.world_model.wan.test_end_to_end import settings
 from tests.unit.world_model.wan.test_trained_parts import changed
 

@@ -7,8 +7,8 @@ import torch
 from services.world_model.network.inputs import build_inputs
 from services.world_model.network.model import JointWorldModel
 from services.world_model.pretrained_video import load_pretrained
-from services.world_model.training.dataset import WindowPosition, WindowSampler
-from services.world_model.training.objective import LossOptions
+from services.world_model.training.joint_dataset import WindowPosition, WindowSampler
+from services.world_model.training.joint_objective import LossOptions
 from tests.unit.world_model.conftest import losses
 
 

@@ -10,8 +10,8 @@ from dextouch.episodes import EpisodeStore
 from services.world_model.checkpoints import read_checkpoint
 from services.world_model.paper_settings import LoraSettings, TrainSettings
 from services.world_model.training.distribution import Processes
-from services.world_model.training.trainer import train
-from services.world_model.training.training_state import StateFiles
+from services.world_model.training.joint_trainer import train
+from services.world_model.training.resume_files import StateFiles
 from tests.unit.world_model.conftest import write_episode
 from tests.unit.world_model.test_distribution import curve_of, run_processes
 from tests.unit.world_model.wan.test_end_to_end import settings

@@ -16,9 +16,9 @@ from services.world_model.network.video import AdaptedLinear, is_adapter
 from services.world_model.paper_settings import LoraSettings, TrainCommand
 from services.world_model.pretrained_video import freeze_pretrained, is_pretrained
 from services.world_model.training.distribution import Processes, joined_processes
-from services.world_model.training.objective import errors, examples_of
-from services.world_model.training.trainer import TrainingRun, train_on
-from services.world_model.training.training_state import state_path
+from services.world_model.training.joint_objective import errors, examples_of
+from services.world_model.training.joint_trainer import TrainingRun, train_on
+from services.world_model.training.resume_files import state_path
 from tests.unit.world_model.test_distribution import sharded
 from tests.unit.world_model.wan.test_end_to_end import settings
 

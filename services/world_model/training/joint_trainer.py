@@ -33,18 +33,18 @@ from services.world_model.pretrained_video import (
     is_pretrained,
     share_texts,
 )
-from services.world_model.training import dataset, episode_sets, tokenizer_trainer, training_state
+from services.world_model.training import episode_sets, joint_dataset, resume_files
 from services.world_model.training.distribution import ALONE, Processes, load_whole, whole_weights
-from services.world_model.training.episode_sets import check_disjoint, load_split
 from services.world_model.training.evaluation import evaluate_prediction, refuse_trained
-from services.world_model.training.objective import (
+from services.world_model.training.joint_objective import (
     LossOptions,
     errors,
     examples_of,
     own_context,
 )
+from services.world_model.training.tokenizer_trainer import check_unseen, with_tokenizer
 
-LOG_EVERY_STEPS = 20
+LOG_EVERY_STEPS = 20  # rows of a report's `log`, kept for resumed runs, too
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class TrainingRun:
 
     def __init__(
         self,
-        episodes: Sequence[dataset.TrainingEpisode],
+        episodes: Sequence[joint_dataset.TrainingEpisode],
         settings: TrainSettings,
         processes: Processes = ALONE,
     ) -> None:
@@ -101,7 +101,7 @@ class TrainingRun:
         # Generator states after the windows trained on, and after those read ahead.
         self._window_numbers = json.dumps(self._rng.bit_generator.state)
         self._drawn: deque[str] = deque()
-        self._sampler = dataset.WindowSampler(
+        self._sampler = joint_dataset.WindowSampler(
             episodes,
             self._rng,
             max_steps=self._window_steps(settings.network.max_steps),
@@ -199,15 +199,15 @@ class TrainingRun:
             model.merge_adapters()
         return model.eval()
 
-    def state(self, identity: dict[str, JsonValue]) -> training_state.TrainingState:
+    def state(self, identity: dict[str, JsonValue]) -> resume_files.TrainingState:
         """Tensors and metadata that the next steps depend on."""
         named = self.model.named_parameters()
         given = {n for n, one in named if is_pretrained(n) and not one.requires_grad}
         tensors = {f"model.{n}": t for n, t in self.model.state_dict().items() if n not in given}
         tensors |= {f"averaged.{n}": t for n, t in self._averages.items()}
-        tensors |= training_state.optimizer_tensors(self.loop.optimizer, self.learned)
+        tensors |= resume_files.optimizer_tensors(self.loop.optimizer, self.learned)
         tensors["generator"] = self._generator.get_state()
-        facts = training_state.RunFacts(
+        facts = resume_files.RunFacts(
             identity=identity,
             step=self.budget.step,
             cpu_s=self.budget.cpu_s,
@@ -215,17 +215,17 @@ class TrainingRun:
             window_numbers=self._window_numbers,
             log=tuple(astuple(entry) for entry in self.log),
         )
-        return training_state.TrainingState(tensors, facts)
+        return resume_files.TrainingState(tensors, facts)
 
-    def restore(self, state: training_state.TrainingState) -> None:
+    def restore(self, state: resume_files.TrainingState) -> None:
         """Continue from `state`."""
-        weights = training_state.part_of(state.tensors, "model.")
+        weights = resume_files.part_of(state.tensors, "model.")
         self.model.load_state_dict(weights, strict=False)
         self._averages = {
             name: average.to(self.model.device)
-            for name, average in training_state.part_of(state.tensors, "averaged.").items()
+            for name, average in resume_files.part_of(state.tensors, "averaged.").items()
         }
-        training_state.restore_optimizer(self.loop.optimizer, self.learned, state.tensors)
+        resume_files.restore_optimizer(self.loop.optimizer, self.learned, state.tensors)
         self._generator.set_state(state.tensors["generator"])
         self._window_numbers = state.facts.window_numbers
         self._rng.bit_generator.state = json.loads(self._window_numbers)
@@ -257,7 +257,7 @@ class TrainingRun:
                 on_step(self)
         return self.log
 
-    def learn(self, batch: dataset.WindowBatch) -> tuple[float, float]:
+    def learn(self, batch: joint_dataset.WindowBatch) -> tuple[float, float]:
         """One optimizer step; returns the video and tactile losses."""
         settings, num_parts = self.settings.optimizer, self.settings.accumulate
         if self.settings.self_forcing:
@@ -296,19 +296,20 @@ class TrainingRun:
         video, tactile = self.processes.mean(both).tolist()
         return video, tactile
 
-    def _batches(self) -> Iterator[dataset.WindowBatch]:
+    def _batches(self) -> Iterator[joint_dataset.WindowBatch]:
+        places = self._noted_places()
         if self.settings.streaming:
             workers = self.settings.loader_workers
-            return dataset.read_batches(self.episodes, self._noted_places(), num_workers=workers)
-        return map(self._sampler.cut, self._noted_places())
+            return joint_dataset.read_batches(self.episodes, places, num_workers=workers)
+        return map(self._sampler.cut, places)
 
-    def _noted_places(self) -> Iterator[list[dataset.WindowPosition]]:
+    def _noted_places(self) -> Iterator[list[joint_dataset.WindowPosition]]:
         """`places`, recording the generator state after each, since readers fetch ahead."""
         for places in self.places():
             self._drawn.append(json.dumps(self._rng.bit_generator.state))
             yield self.processes.own(places)
 
-    def places(self) -> Iterator[list[dataset.WindowPosition]]:
+    def places(self) -> Iterator[list[joint_dataset.WindowPosition]]:
         """Endless iterator over the places of the windows of each step."""
         longest, rng = self.settings.network.max_steps, self._rng
         while True:
@@ -324,7 +325,7 @@ class TrainingRun:
         return 2 * num_steps - 1 if self.settings.self_forcing else num_steps
 
 
-def _all_views(batch: dataset.WindowBatch) -> UInt8[Tensor, "n time px px 3"]:
+def _all_views(batch: joint_dataset.WindowBatch) -> UInt8[Tensor, "n time px px 3"]:
     """Images of the head, then of the further views that are not missing."""
     if batch.further is None:
         return batch.images
@@ -356,26 +357,26 @@ def train(
     Raises:
         InvalidInputError: no episodes, too short ones, or held-out ones among those trained on.
     """
-    trained, heldout = load_split(settings)
+    trained, heldout = episode_sets.load_split(settings)
     return train_on(trained, heldout, settings, on_progress, processes)
 
 
 def train_on(
-    trained: Sequence[dataset.TrainingEpisode],
-    heldout: Sequence[dataset.EpisodeArrays],
+    trained: Sequence[joint_dataset.TrainingEpisode],
+    heldout: Sequence[joint_dataset.EpisodeArrays],
     settings: TrainSettings,
     on_progress: OnProgress | None = None,
     processes: Processes = ALONE,
 ) -> TrainingReport | None:
     """`train` with episodes that are already split."""
-    check_disjoint(trained, heldout)
-    settings, tokenizer = tokenizer_trainer.with_tokenizer(settings)
+    episode_sets.check_disjoint(trained, heldout)
+    settings, tokenizer = with_tokenizer(settings)
     settings, layouts = settings.with_adapters(), [e.tactile_layout for e in (*trained, *heldout)]
     layout = common_layout(layouts, what="training episodes")
     if tokenizer is not None:
         known = settings.network.tactile_layout
         common_layout([known, layout], what="--tokenizer and the training episodes")
-        tokenizer_trainer.check_unseen(heldout, tokenizer)
+        check_unseen(heldout, tokenizer)
     settings = settings.model_copy(update={"network": settings.network.with_layout(layout)})
     torch.set_num_threads(settings.num_threads)
     ancestor = None if settings.init is None else checkpoints.read_checkpoint(settings.init)
@@ -389,7 +390,7 @@ def train_on(
     run = TrainingRun(trained, settings, processes)
     log = _run_or_resume(run, ancestor, tokenizer, on_progress)
     averaged = run.whole_average()
-    files, budget = training_state.StateFiles(settings.output, processes), run.budget
+    files, budget = resume_files.StateFiles(settings.output, processes), run.budget
     # Its gradients and moments need not be there while the checkpoint is evaluated.
     del run
     if averaged is None:
@@ -430,8 +431,8 @@ def _metadata(
     settings: TrainSettings,
     network: NetworkConfig,
     budget: optimizer.Budget,
-    trained: Sequence[dataset.TrainingEpisode],
-    heldout: Sequence[dataset.EpisodeArrays],
+    trained: Sequence[joint_dataset.TrainingEpisode],
+    heldout: Sequence[joint_dataset.EpisodeArrays],
     ancestor: checkpoints.Checkpoint | None,
 ) -> checkpoints.CheckpointMetadata:
     """Provenance of a trained model, with that of the checkpoint that it was started from."""
@@ -472,7 +473,7 @@ def _metadata(
 
 
 def _data_hash(
-    episodes: Sequence[dataset.TrainingEpisode],
+    episodes: Sequence[joint_dataset.TrainingEpisode],
     settings: TrainSettings,
     ancestor: checkpoints.Checkpoint | None,
 ) -> str:
@@ -492,8 +493,8 @@ def _run_or_resume(
 ) -> list[TrainingProgress]:
     """Run from the start or resume an interrupted run; saves its state regularly."""
     settings = run.settings
-    files = training_state.StateFiles(settings.output, run.processes)
-    identity = training_state.identity_of(
+    files = resume_files.StateFiles(settings.output, run.processes)
+    identity = resume_files.identity_of(
         settings,
         data_hash=_data_hash(run.episodes, settings, None),
         init_digest=None if ancestor is None else ancestor.digest,
@@ -502,7 +503,7 @@ def _run_or_resume(
     if ancestor is not None:
         run.start_from(ancestor)
     if settings.resume and files.exists():
-        like = {**training_state.moments_like(run.learned), **run.state(identity).tensors}
+        like = {**resume_files.moments_like(run.learned), **run.state(identity).tensors}
         run.restore(files.read(identity, like))
         if run.budget.share() >= 1.0 and is_cut_short(settings, run.budget):
             raise ConflictError(

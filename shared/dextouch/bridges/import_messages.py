@@ -16,8 +16,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from dextouch.bridges.exporting import SEQUENCE, T_DEVICE
-from dextouch.bridges.foreign_images import (
+from dextouch.bridges.export_files import SEQUENCE, T_DEVICE
+from dextouch.bridges.import_images import (
     check_codec,
     compressed_form,
     decode_png,

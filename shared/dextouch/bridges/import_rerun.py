@@ -14,9 +14,8 @@ import pyarrow as pa
 import pyarrow.types as arrow_types
 from rerun.chunk import Chunk, RrdReader
 
-from dextouch.bridges.foreign import ImportAttributes, ImportReport
-from dextouch.bridges.foreign_images import RAW, check_codec, check_pixels
-from dextouch.bridges.foreign_messages import (
+from dextouch.bridges.import_images import RAW, check_codec, check_pixels
+from dextouch.bridges.import_messages import (
     MAX_POINTS,
     NUMBERS_UNIT,
     POSE_UNIT,
@@ -27,7 +26,8 @@ from dextouch.bridges.foreign_messages import (
     encoded_image,
     raw_image,
 )
-from dextouch.bridges.foreign_streams import Reading, Survey, import_readings
+from dextouch.bridges.import_recording import ImportAttributes, ImportReport
+from dextouch.bridges.import_streams import Reading, Survey, import_readings
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import (
     CorruptDataError,

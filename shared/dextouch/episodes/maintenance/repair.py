@@ -11,7 +11,6 @@ import numpy as np
 from pydantic import BaseModel
 
 from dextouch.data_folder import is_system_file
-from dextouch.episodes.care.salvage import SalvagedStream, group_streams, on_one_grid, spool_streams
 from dextouch.episodes.files import (
     PARTIAL,
     GroupFiles,
@@ -46,9 +45,15 @@ from dextouch.episodes.format import (
     with_rows,
 )
 from dextouch.episodes.groups import GroupContents, read_group
+from dextouch.episodes.maintenance.salvage import (
+    SalvagedStream,
+    group_streams,
+    on_one_grid,
+    spool_streams,
+)
 from dextouch.episodes.spool import SpoolReader, read_attributes
 from dextouch.episodes.spool_log import RECORDING_FILE, body_at, find_records, open_log
-from dextouch.episodes.stages import DOWNLOADS, STAGING, new_stage
+from dextouch.episodes.staging import DOWNLOADS, STAGING, new_stage
 from dextouch.episodes.store import EpisodeStore
 from dextouch.episodes.trash import (
     HOMES,

@@ -18,7 +18,13 @@ from pathlib import Path
 
 import structlog
 
-from dextouch.episodes.files import LocalGroup, Stamps, disk_errors, unheld_folders, write_file
+from dextouch.episodes.files import (
+    GroupFingerprint,
+    LocalGroup,
+    disk_errors,
+    unheld_folders,
+    write_file,
+)
 from dextouch.episodes.format import (
     COMMIT_FILE,
     KINDS,
@@ -28,8 +34,8 @@ from dextouch.episodes.format import (
     attributes_id,
     decode_commit,
 )
-from dextouch.episodes.object_bucket import Bucket, ObjectFacts, parse_address
-from dextouch.episodes.stages import new_stage, sweep_stages
+from dextouch.episodes.s3_bucket import Bucket, ObjectFacts, parse_address
+from dextouch.episodes.staging import new_stage, sweep_stages
 from dextouch.episodes.trash import REMARK_FILES
 from dextouch.episodes.writer import EpisodeWriter
 from dextouch.errors import (
@@ -250,7 +256,7 @@ class ObjectStorage:
         """Ids of a kind; takes one request per 1000 of them."""
         return dict.fromkeys(self._bucket.folders(f"{kind}s"), 0)
 
-    def stamps(self, kind: Kind, numbers: Mapping[str, int]) -> dict[str, Stamps]:
+    def fingerprints(self, kind: Kind, numbers: Mapping[str, int]) -> dict[str, GroupFingerprint]:
         """Entity tags of what a catalog is made of: of few ids one by one, of many from a list."""
         is_few = len(numbers) <= _MAX_ONE_BY_ONE
         folders = [group_key(kind, name) for name in numbers] if is_few else [f"{kind}s"]
@@ -259,7 +265,7 @@ class ObjectStorage:
             _, name, *rest = facts.key.split("/")
             tags.setdefault(name, {})["/".join(rest)] = facts.etag
         return {
-            name: Stamps(
+            name: GroupFingerprint(
                 number,
                 f"{tags[name][COMMIT_FILE]} {tags[name].get(METADATA_FILE, '')}",
                 " ".join(tags[name].get(file, "") for file in REMARK_FILES),

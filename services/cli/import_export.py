@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import ValidationError
 
+from dextouch.bridges.formats import FORMATS
 from dextouch.command_line import progress, write_result
 from dextouch.data_folder import is_system_file
 from dextouch.episodes import (
@@ -21,14 +22,14 @@ from dextouch.episodes import (
 from dextouch.errors import ConflictError, DexTouchError, InvalidInputError, NotFoundError
 from dextouch.schemas import first_problems
 from services.pipelines.parsers import (
-    JOINT_FORMATS,
+    EXPORT_FILTERS,
     check_format_options,
     export_parser,
     import_parser,
 )
 
 if TYPE_CHECKING:
-    from dextouch.bridges.foreign import ImportReport
+    from dextouch.bridges.import_recording import ImportReport
 
 Reader = EpisodeReader | RecordingReader
 Report = dict[str, Any]
@@ -36,20 +37,17 @@ Report = dict[str, Any]
 DamagedImages = dict[str, dict[str, list[int]]]
 # Exit status if some of several files were refused, as of a command that is.
 _SOME_FAILED = 3
-# Options that choose items, as on the dashboard's list.
-FILTERS = (
-    "text", "task", "operator", "station", "domain", "outcome", "origin", "review", "after",
-    "before",
-)  # fmt: skip
 # Of damaged images, in a message; the JSON report has all.
 MAX_NAMED = 20
 
 
-def _export_one(reader: Reader, path: Path, options: argparse.Namespace) -> int:
-    if options.format == "rrd":
-        from dextouch.bridges.rerun import export_rrd
+def _export_rrd(reader: Reader, path: Path, options: argparse.Namespace) -> int:
+    from dextouch.bridges.rerun import export_rrd
 
-        return export_rrd(reader, path, overwrite=options.force)
+    return export_rrd(reader, path, overwrite=options.force)
+
+
+def _export_mcap(reader: Reader, path: Path, options: argparse.Namespace) -> int:
     from dextouch.bridges.mcap import export_mcap
 
     return export_mcap(
@@ -61,12 +59,13 @@ def _export_one(reader: Reader, path: Path, options: argparse.Namespace) -> int:
     )
 
 
-def _export_all(readers: Iterator[EpisodeReader], options: argparse.Namespace) -> Report:
-    """Write all episodes together; the report's part about them."""
-    if options.format == "umi":
-        from dextouch.bridges.umi import export_umi
+def _export_umi(readers: Iterator[EpisodeReader], options: argparse.Namespace) -> Report:
+    from dextouch.bridges.umi import export_umi
 
-        return {"num_steps": export_umi(readers, options.to, overwrite=options.force)}
+    return {"num_steps": export_umi(readers, options.to, overwrite=options.force)}
+
+
+def _export_lerobot(readers: Iterator[EpisodeReader], options: argparse.Namespace) -> Report:
     from dextouch.bridges.lerobot import ExportOptions, export_dataset
 
     chosen = ExportOptions(
@@ -91,9 +90,15 @@ def _export_all(readers: Iterator[EpisodeReader], options: argparse.Namespace) -
     }
 
 
+# Write one item and return the number of messages; write all episodes, and the report about them.
+_EXPORT_ONE = {"mcap": _export_mcap, "rrd": _export_rrd}
+_EXPORT_ALL = {"umi": _export_umi, "lerobot": _export_lerobot}
+
+
 def _ids(store: EpisodeStore, options: argparse.Namespace) -> list[str]:
     """The given ids, or those that match the filters and were not rejected in review."""
-    criteria = {key: value for key in FILTERS if (value := getattr(options, key)) is not None}
+    given = vars(options)
+    criteria = {key: given[key] for key in EXPORT_FILTERS if given[key] is not None}
     if options.ids and criteria:
         raise InvalidInputError(f"got ids and filters {sorted(criteria)}; expected one of the two")
     if len(set(options.ids)) != len(options.ids):
@@ -172,7 +177,7 @@ def _episodes(
 def _export(options: argparse.Namespace) -> Report:
     store, to, form = EpisodeStore(options.store), options.to, options.format
     check_format_options(export_parser(), options, form)
-    if form in JOINT_FORMATS and options.kind == "recording":
+    if FORMATS[form].is_joint and options.kind == "recording":
         raise InvalidInputError(
             f"format {form!r} holds episodes only; export recordings as mcap or rrd"
         )
@@ -180,9 +185,9 @@ def _export(options: argparse.Namespace) -> Report:
     damaged: DamagedImages = {}
     report: Report = {"format": form, "kind": options.kind, "ids": ids, "damaged_images": damaged}
     tracked = progress(ids, f"export {form}", len(ids))
-    if form in JOINT_FORMATS:
+    if FORMATS[form].is_joint:
         left_out: list[str] = []
-        done = _export_all(_episodes(store, tracked, damaged, left_out), options)
+        done = _EXPORT_ALL[form](_episodes(store, tracked, damaged, left_out), options)
         num_new = len(ids) - len(left_out) - len(done.get("present", []))
         print(f"{to}  {num_new} episodes  {done['num_steps']} steps")
         return report | done | {"path": str(to), "left_out": left_out}
@@ -192,7 +197,7 @@ def _export(options: argparse.Namespace) -> Report:
     for item_id in tracked:
         reader = store.open_item(options.kind, item_id)
         _note_damaged(reader, damaged)
-        count = _export_one(reader, paths[item_id], options)
+        count = _EXPORT_ONE[form](reader, paths[item_id], options)
         files.append({"id": item_id, "path": str(paths[item_id]), "num_messages": count})
         print(f"{paths[item_id]}  {count} messages")
         exported.append(reader.attributes)
@@ -248,7 +253,7 @@ def _import(options: argparse.Namespace) -> Report:
     store, path = EpisodeStore(options.store), options.path
     if not path.exists():
         raise NotFoundError(f"{path}: no such file or folder")
-    from dextouch.bridges.foreign import find_format
+    from dextouch.bridges.import_recording import find_format
 
     form = options.format or find_format(path)
     check_format_options(import_parser(), options, form)
@@ -295,7 +300,7 @@ def _import(options: argparse.Namespace) -> Report:
 def _import_file(
     path: Path, store: EpisodeStore, form: str, options: argparse.Namespace
 ) -> "ImportReport":
-    from dextouch.bridges.foreign import ImportAttributes
+    from dextouch.bridges.import_recording import ImportAttributes
     from dextouch.tactile.layout import read_layout
 
     about = ImportAttributes(
@@ -308,10 +313,10 @@ def _import_file(
         layout=None if options.layout is None else read_layout(options.layout),
     )
     if form == "rrd":
-        from dextouch.bridges.foreign_rerun import import_rrd
+        from dextouch.bridges.import_rerun import import_rrd
 
         return import_rrd(path, store, about, timeline=options.timeline)
-    from dextouch.bridges.foreign_mcap import import_any_mcap
+    from dextouch.bridges.import_mcap import import_any_mcap
 
     return import_any_mcap(path, store, about)
 

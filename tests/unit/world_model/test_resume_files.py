@@ -15,10 +15,10 @@ import torch
 from dextouch.errors import ConflictError, CorruptDataError, InvalidInputError
 from services.networks import optimizer
 from services.world_model.checkpoints import read_checkpoint
-from services.world_model.training import trainer
+from services.world_model.training import joint_trainer
 from services.world_model.training.distribution import ALONE
-from services.world_model.training.trainer import TrainingRun, train, train_on
-from services.world_model.training.training_state import StateFiles, state_path
+from services.world_model.training.joint_trainer import TrainingRun, train, train_on
+from services.world_model.training.resume_files import StateFiles, state_path
 
 CHILD = Path(__file__).with_name("killed_training.py")
 ROOT = Path(__file__).parents[3]
@@ -182,7 +182,7 @@ def test_seconds_between_states_count_from_the_end_of_the_last_one(
 ):
     now_s, kept = [0.0], []
     clock = SimpleNamespace(monotonic=lambda: now_s[0], process_time=lambda: 0.0)
-    for module in (optimizer, trainer):
+    for module in (optimizer, joint_trainer):
         monkeypatch.setattr(module, "time", clock)
 
     def learn(run, batch):
@@ -196,5 +196,5 @@ def test_seconds_between_states_count_from_the_end_of_the_last_one(
     monkeypatch.setattr(TrainingRun, "learn", learn)
     monkeypatch.setattr(StateFiles, "write", write)
     slow = settings.model_copy(update={"max_steps": 12, "state_every_s": 5.0})
-    trainer._run_or_resume(TrainingRun(toy_episodes, slow), None, None, None)
+    joint_trainer._run_or_resume(TrainingRun(toy_episodes, slow), None, None, None)
     assert kept == [5, 10]

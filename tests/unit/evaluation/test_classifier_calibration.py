@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from dextouch.errors import InvalidInputError
-from services.evaluation.calibration import (
+from services.evaluation.classifier_calibration import (
     brier,
     expected_calibration_error,
     final_endings,

@@ -12,7 +12,8 @@ import numpy as np
 from pydantic import ValidationError
 
 from dextouch import __version__
-from dextouch.bridges.exporting import Block
+from dextouch.bridges.export_files import Block
+from dextouch.bridges.formats import FILE_SIGNATURES
 from dextouch.episodes import EpisodeStore, EpisodeWriter, disk_errors
 from dextouch.errors import ConflictError, InvalidInputError, UnknownNameError
 from dextouch.schemas import Domain, ImportedFile, RecordingAttributes, first_problems
@@ -24,8 +25,6 @@ MAX_NAME: Final = 64
 MAX_ID: Final = 128
 # Suffixes of the arrays beside a stream's values, which no other stream may be called.
 _STAMP_SUFFIXES: Final = ("_t_host_ns", "_t_device_ns", "_sequence")
-# First bytes of the formats of single files.
-MAGIC: Final = {"mcap": b"\x89MCAP0\r\n", "rrd": b"RRF"}
 _NS_PER_S: Final = 1_000_000_000
 _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 # Host times before are those of a clock that counts from its start, not from 1970.
@@ -176,7 +175,7 @@ def find_format(path: Path) -> str:
     if path.is_dir():
         if (path / "meta" / "info.json").is_file():
             return "lerobot"
-        forms = [form for form in MAGIC if any(path.glob(f"*.{form}"))]
+        forms = [form for form in FILE_SIGNATURES if any(path.glob(f"*.{form}"))]
         if len(forms) == 1:
             return forms[0]
         if forms:
@@ -185,8 +184,8 @@ def find_format(path: Path) -> str:
     else:
         with disk_errors(f"read {path}"), path.open("rb") as file:
             start = file.read(8)
-        for form, magic in MAGIC.items():
-            if start.startswith(magic):
+        for form, signature in FILE_SIGNATURES.items():
+            if start.startswith(signature):
                 return form
         found = f"a file that begins with {start.hex(' ') or 'nothing'}"
     raise InvalidInputError(

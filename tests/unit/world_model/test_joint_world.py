@@ -9,6 +9,7 @@ import torch
 from dextouch.errors import (
     DexTouchError,
     InvalidInputError,
+    LimitExceededError,
     NonFiniteError,
     ShapeError,
     UnavailableError,
@@ -17,10 +18,10 @@ from dextouch.errors import (
 from dextouch.schemas import Observation, ReturnSelector, RolloutStart
 from dextouch.streams import HEAD_CAMERA
 from dextouch.worlds import BatchWorld, World
-from services.world_model import world as world_module
+from services.world_model import joint_world
+from services.world_model.joint_world import JointWorld
 from services.world_model.network.inputs import build_inputs
-from services.world_model.training.dataset import WindowPosition
-from services.world_model.world import ModelWorld
+from services.world_model.training.joint_dataset import WindowPosition
 
 
 @pytest.fixture
@@ -29,7 +30,7 @@ def world(checkpoint):
     torch.manual_seed(0)
     for parameter in checkpoint.model.parameters():
         parameter.add_(0.03 * torch.randn(parameter.shape))
-    return ModelWorld(checkpoint)
+    return JointWorld(checkpoint)
 
 
 def make_start(episode, start=0, kind="commanded"):
@@ -75,7 +76,7 @@ def test_loader_and_server_give_identical_tensors(world, toy_episode, monkeypatc
         seen.append(build_inputs(requests, config))
         return seen[-1]
 
-    monkeypatch.setattr(world_module, "build_inputs", spy)
+    monkeypatch.setattr(joint_world, "build_inputs", spy)
     for kind in ("measured", "commanded"):
         loader = build_inputs(
             [episode.cut(WindowPosition(0, 0, 17, action_kind=kind)).request], world._model.config
@@ -105,7 +106,7 @@ def test_later_chunks_are_re_anchored_to_where_the_rollout_stands(world, toy_epi
     actions = episode.actions["commanded"]
     state = world.reset(make_start(episode)).state
     state = world.step(state, actions[1:9], seed=0).state
-    monkeypatch.setattr(world_module, "build_inputs", spy)
+    monkeypatch.setattr(joint_world, "build_inputs", spy)
     world.step(state, actions[9:17], seed=0)
     expected = build_inputs(
         [episode.cut(WindowPosition(0, 8, 9, action_kind="commanded", from_command=True)).request],
@@ -233,9 +234,11 @@ def test_chunks_it_cannot_follow_are_refused(world, toy_episode):
     episode = toy_episode(0)
     state = world.reset(make_start(episode)).state
     rows = episode.actions["commanded"]
-    for length in (1, 3, 18, 20):
+    for length in (1, 3, 18):
         with pytest.raises(ShapeError):
             world.step(state, rows[1 : 1 + length], seed=0)
+    with pytest.raises(LimitExceededError, match="got 20 steps, expected at most 16"):
+        world.step(state, rows[1:21], seed=0)
     broken = rows[1:5].copy()
     broken[2, 30] = np.nan
     with pytest.raises(NonFiniteError):

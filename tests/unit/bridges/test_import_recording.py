@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from dextouch import __version__
-from dextouch.bridges.exporting import Block, wall_offset_ns
-from dextouch.bridges.foreign import (
+from dextouch.bridges.export_files import Block, wall_offset_ns
+from dextouch.bridges.import_recording import (
     ForeignStream,
     ImportAttributes,
     Refused,

@@ -21,16 +21,16 @@ from google.protobuf.message_factory import GetMessageClass
 from mcap.exceptions import McapError
 from mcap.records import Attachment, Channel, Message, Metadata, Schema
 
-from dextouch.bridges.exporting import SEQUENCE
-from dextouch.bridges.foreign import ImportAttributes, ImportReport
-from dextouch.bridges.foreign_messages import (
+from dextouch.bridges.export_files import SEQUENCE
+from dextouch.bridges.import_messages import (
     CALIBRATIONS,
     Plain,
     camera_model,
     items_of,
     schema_name,
 )
-from dextouch.bridges.foreign_streams import Reading, Survey, import_readings
+from dextouch.bridges.import_recording import ImportAttributes, ImportReport
+from dextouch.bridges.import_streams import Reading, Survey, import_readings
 from dextouch.bridges.mcap import ABOUT, ATTRIBUTES_FILE, import_mcap, records
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import CorruptDataError, DexTouchError, InvalidInputError, LimitExceededError

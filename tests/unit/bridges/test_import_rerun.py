@@ -11,8 +11,8 @@ from PIL import Image
 
 rr = pytest.importorskip("rerun", reason="rerun-sdk is not installed: pip install '.[rerun]'")
 
-from dextouch.bridges.foreign import ImportAttributes  # noqa: E402
-from dextouch.bridges.foreign_rerun import import_rrd  # noqa: E402
+from dextouch.bridges.import_recording import ImportAttributes  # noqa: E402
+from dextouch.bridges.import_rerun import import_rrd  # noqa: E402
 from dextouch.bridges.rerun import export_rrd  # noqa: E402
 from dextouch.episodes import EpisodeStore  # noqa: E402
 from dextouch.errors import InvalidInputError  # noqa: E402
@@ -192,8 +192,8 @@ def test_what_is_left_out_is_said(store, tmp_path):
 # Imports damaged copies of a file from the number argv[3] on, and says each number first.
 CHILD = """
 import contextlib, pathlib, random, sys
-from dextouch.bridges.foreign import ImportAttributes
-from dextouch.bridges.foreign_rerun import import_rrd
+from dextouch.bridges.import_recording import ImportAttributes
+from dextouch.bridges.import_rerun import import_rrd
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import DexTouchError
 source, folder = pathlib.Path(sys.argv[1]).read_bytes(), pathlib.Path(sys.argv[2])

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from dextouch.errors import InvalidInputError
-from services.world_model.training.dataset import (
+from services.world_model.training.joint_dataset import (
     WindowPosition,
     WindowSampler,
     load_episodes,

@@ -9,10 +9,10 @@ import pytest
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
-from dextouch.bridges import foreign_mcap, foreign_streams
-from dextouch.bridges.foreign import ImportAttributes
-from dextouch.bridges.foreign_mcap import import_any_mcap
-from dextouch.bridges.foreign_messages import items_of
+from dextouch.bridges import import_mcap, import_streams
+from dextouch.bridges.import_mcap import import_any_mcap
+from dextouch.bridges.import_messages import items_of
+from dextouch.bridges.import_recording import ImportAttributes
 from dextouch.bridges.mcap import export_mcap, records
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import (
@@ -311,7 +311,7 @@ def test_memory_of_the_whole_is_limited(store, tmp_path, monkeypatch):
     recorder.channel("/p", "foxglove.PointCloud", "jsonschema", b"{}")
     for k, count in enumerate((1000, 1, 1, 1)):
         recorder.raw("/p", cloud(count), T0 - k)
-    monkeypatch.setattr(foreign_streams, "MAX_HELD_BYTES", 15_000)
+    monkeypatch.setattr(import_streams, "MAX_HELD_BYTES", 15_000)
     with pytest.raises(InvalidInputError, match="too much to sort"):
         import_any_mcap(recorder.done(), store, ImportAttributes())
     path = tmp_path / "b.mcap"
@@ -347,8 +347,8 @@ def test_publishers_of_one_topic_have_streams_of_their_own(store, tmp_path):
 
 
 def test_a_schema_is_read_once(store, tmp_path, monkeypatch):
-    read, count = foreign_mcap._decoder_of, []
-    monkeypatch.setattr(foreign_mcap, "_decoder_of", lambda *a: count.append(a) or read(*a))
+    read, count = import_mcap._decoder_of, []
+    monkeypatch.setattr(import_mcap, "_decoder_of", lambda *a: count.append(a) or read(*a))
     messages = [(f"/{k}", "x", {"v": k}) for k in range(5)]
     recorder = Recorder(tmp_path / "a.mcap")
     number = recorder.writer.register_schema("x", "jsonschema", b"{}")

@@ -14,8 +14,8 @@ from obstore.store import S3Store
 from zarr.storage import ObjectStore
 
 from dextouch.episodes import EpisodeStore
-from dextouch.episodes.object_bucket import Bucket
-from dextouch.episodes.object_storage import BLOCK_BYTES, ORPHAN_AGE, sweep_orphans
+from dextouch.episodes.bucket_storage import BLOCK_BYTES, ORPHAN_AGE, sweep_orphans
+from dextouch.episodes.s3_bucket import Bucket
 from dextouch.errors import (
     InvalidInputError,
     NotFoundError,
@@ -120,7 +120,7 @@ def unused_port():
 DYING_WRITER = """
 import os, signal, sys
 from dextouch.episodes import EpisodeStore
-from dextouch.episodes.object_bucket import Bucket
+from dextouch.episodes.s3_bucket import Bucket
 from tests.contracts.s3_server import CREDENTIALS
 from tests.unit.episodes.conftest import episode_of
 
@@ -290,7 +290,7 @@ def test_ctrl_c_while_an_uploaded_take_is_removed_here_costs_nothing(store, monk
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr("dextouch.episodes.object_storage.shutil.rmtree", interrupted)
+        patch.setattr("dextouch.episodes.bucket_storage.shutil.rmtree", interrupted)
         with pytest.raises(KeyboardInterrupt):
             writer.__exit__(None, None, None)
     assert store.complete_uploads() == ()

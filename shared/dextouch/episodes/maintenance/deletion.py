@@ -2,7 +2,7 @@
 
 The plan is journaled first (`.deletions/`), so that repeating an interrupted deletion completes it,
 even when the recordings that led to derived episodes are already gone. What was deleted is
-remembered (`dextouch.episodes.care.deletion_records`), so that stations remove their copies.
+remembered (`dextouch.episodes.maintenance.deletion_records`), so that stations remove their copies.
 """
 
 import json
@@ -18,8 +18,10 @@ from typing import Final
 
 from pydantic import BaseModel, Field, ValidationError
 
-from dextouch.episodes.care.deletion_records import DeletionRecords, TakeFacts
-from dextouch.episodes.care.item_facts import (
+from dextouch.episodes.files import disk_errors, held_folder, replace_file, try_lock
+from dextouch.episodes.format import Kind, sha256_hex
+from dextouch.episodes.maintenance.deletion_records import DeletionRecords, TakeFacts
+from dextouch.episodes.maintenance.item_facts import (
     PLACES,
     SIGNED_FILES,
     Facts,
@@ -29,9 +31,7 @@ from dextouch.episodes.care.item_facts import (
     small_files,
     without_author,
 )
-from dextouch.episodes.files import disk_errors, held_folder, replace_file, try_lock
-from dextouch.episodes.format import Kind, sha256_hex
-from dextouch.episodes.stages import DOWNLOADS, sweep_stages
+from dextouch.episodes.staging import DOWNLOADS, sweep_stages
 from dextouch.episodes.trash import TRASH, put_into_trash, remove_for_good
 from dextouch.errors import CorruptDataError, InvalidInputError, NotFoundError
 from dextouch.free_text import texts_in

@@ -7,9 +7,9 @@ import tracemalloc
 import pytest
 from mcap.writer import CompressionType
 
-from dextouch.bridges import foreign_streams
-from dextouch.bridges.foreign import ImportAttributes
-from dextouch.bridges.foreign_mcap import import_any_mcap
+from dextouch.bridges import import_streams
+from dextouch.bridges.import_mcap import import_any_mcap
+from dextouch.bridges.import_recording import ImportAttributes
 from dextouch.bridges.mcap import export_mcap
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import (
@@ -85,11 +85,11 @@ def test_limits_and_mistakes_are_errors(store, tmp_path, monkeypatch):
     ):
         with pytest.raises(InvalidInputError, match=part):
             import_any_mcap(path, store, ImportAttributes(mapping=mapping))
-    monkeypatch.setattr(foreign_streams, "MAX_SAMPLES", 20)
+    monkeypatch.setattr(import_streams, "MAX_SAMPLES", 20)
     with pytest.raises(LimitExceededError, match="more than 20 samples"):
         import_any_mcap(path, store, ImportAttributes())
     monkeypatch.undo()
-    monkeypatch.setattr(foreign_streams, "MAX_STREAMS", 2)
+    monkeypatch.setattr(import_streams, "MAX_STREAMS", 2)
     mapping = {"camera_head": "/cam/png"}
     report = import_any_mcap(path, store, ImportAttributes(mapping=mapping))
     assert report.imported[0].stream == "camera_head"

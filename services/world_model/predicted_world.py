@@ -23,7 +23,7 @@ from dextouch.images import scaled_square
 from dextouch.schemas import EVERYTHING, Observation, ReturnSelector, RolloutStart, WorldDescription
 from dextouch.streams import HEAD_CAMERA, unpack
 from dextouch.tactile.layout import DEXTOUCH_V1, TactileLayout
-from dextouch.worlds import BatchWorld, SteppedRollout
+from dextouch.worlds import BatchWorld, SteppedRollout, check_chunk
 from services.world_model.checkpoints import StateCheckpoint
 from services.world_model.dynamics.features import (
     BOX_AXES,
@@ -32,11 +32,13 @@ from services.world_model.dynamics.features import (
     poses_from_objects,
 )
 from services.world_model.dynamics.model import first_steps, mean_poses
-from services.world_model.dynamics.trees import stacked
+from services.world_model.dynamics.tensor_trees import stacked
 from services.world_model.network.inputs import ObjectsAtStart, PredictionRequest
 
 # Larger values are mistakes of units or frames.
 MAX_ANCHOR_M, MAX_CAMERA_PX = 5.0, 1e5
+# With one image, of 3 MB at the largest side of 1024 px; snapshots of several views are larger.
+MAX_SNAPSHOT_BYTES = 4 * 2**20
 # A rollout ends once its hands have moved four times the length of a training episode, since no
 # longer ones were trained on, and errors of chunk after chunk add up.
 LAST_HORIZONS = 4
@@ -184,7 +186,8 @@ class PredictedWorld(BatchWorld[State]):
         """Predict action chunks of 4k steps; others of the batch change results by rounding.
 
         Raises:
-            ShapeError: a chunk of another length, or not one and a seed for each rollout.
+            ShapeError: not a chunk of 4k steps and a seed for each rollout.
+            LimitExceededError: chunks of more than `max_chunk_steps`.
             InvalidInputError: physically impossible actions, or views without a start.
             EndedError: hands have moved four times as long as any episode of training.
             UnavailableError: the model predicts NaN or infinity.
@@ -204,18 +207,12 @@ class PredictedWorld(BatchWorld[State]):
                 "was trained on"
             )
             raise EndedError(f"world {world.name}: {reason}", reason=reason)
-        chunks = [check_actions(chunk, where="action chunk") for chunk in actions]
-        multiple, longest, length = world.chunk_multiple, world.max_chunk_steps, len(chunks[0])
-        if length % multiple or length > longest:
-            raise ShapeError(
-                f"action chunk: got {length} rows, expected a multiple of {multiple} up to "
-                f"{longest}"
-            )
+        chunks = [check_actions(check_chunk(chunk, world), where="chunk") for chunk in actions]
         return self._stepped(states, chunks, seeds, requested)
 
 
 def opened_snapshot(
-    data: bytes, digest: str, *, max_bytes: int
+    data: bytes, digest: str, *, max_bytes: int = MAX_SNAPSHOT_BYTES
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Fields and arrays of a snapshot; raises InvalidInputError for one of another digest."""
     fields, arrays = unpack(data, max_bytes=max_bytes)

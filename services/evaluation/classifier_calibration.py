@@ -14,6 +14,7 @@ from services.evaluation.scores import LEAST_DECIDED
 from services.evaluation.settings import RISK_OF_DECIDED
 from services.evaluation.statistics import area_under_roc, balanced_accuracy
 from services.evaluation.success_classifier import (
+    DECISION_THRESHOLD,
     IMAGINED,
     TRUE,
     WHOLE_BAND,
@@ -120,7 +121,7 @@ def fit_combination(
     joint = fitted.probabilities(of_probe, estimated)[agreed]
     for allowed in (risk, 2 * risk):
         band = undecided_band(joint, outcomes[agreed], risk=allowed, widest=WHOLE_BAND)
-        if np.mean(np.abs(joint - 0.5) > band) >= LEAST_DECIDED:
+        if np.mean(np.abs(joint - DECISION_THRESHOLD) > band) >= LEAST_DECIDED:
             break
     return fitted.model_copy(update={"band": band})
 
@@ -128,15 +129,15 @@ def fit_combination(
 def undecided_band(
     probabilities: np.ndarray, success: np.ndarray, *, risk: float, widest: float = _WIDEST_BAND
 ) -> float:
-    """Smallest half width about 0.5 outside of which at most `risk` of the decisions are wrong.
+    """Smallest half width of the band outside of which at most `risk` of the decisions are wrong.
 
-    One error more than observed is assumed, as in conformal risk control, so that few endings give
-    a wide band. The half width is capped at `widest`, even if the risk is then exceeded; with 0.5
-    nothing is decided where no band keeps the risk.
+    It lies about `DECISION_THRESHOLD`. One error more than observed is assumed, as in conformal
+    risk control, so that few endings give a wide band. The half width is capped at `widest`, even
+    if the risk is then exceeded; with 0.5 nothing is decided where no band keeps the risk.
     """
     predicted, outcomes = _pair(probabilities, success)
-    sureness = np.abs(predicted - 0.5)
-    wrong = (predicted >= 0.5) != (outcomes > 0.5)
+    sureness = np.abs(predicted - DECISION_THRESHOLD)
+    wrong = (predicted >= DECISION_THRESHOLD) != (outcomes > 0.5)
     # Just below a half width of 0 all are decided; each step excludes the least certain one.
     for width in np.concatenate([[0.0], np.sort(sureness)]):
         decided = sureness > width if width else np.ones(len(predicted), dtype=bool)

@@ -6,9 +6,9 @@ import torch
 
 from services.world_model.network.inputs import build_inputs
 from services.world_model.network.model import JointLatents
-from services.world_model.training.dataset import WindowSampler
-from services.world_model.training.objective import LossOptions, contact_or_changing
-from services.world_model.training.trainer import TrainingRun
+from services.world_model.training.joint_dataset import WindowSampler
+from services.world_model.training.joint_objective import LossOptions, contact_or_changing
+from services.world_model.training.joint_trainer import TrainingRun
 from tests.unit.world_model.conftest import losses
 
 

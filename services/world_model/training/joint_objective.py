@@ -18,7 +18,7 @@ from dextouch.errors import InvalidInputError
 from dextouch.hands.actions import poses_from_actions, reanchor
 from dextouch.tactile import CONTACT_THRESHOLD_KPA
 from dextouch.tactile.layout import DEXTOUCH_V1, TactileLayout
-from services.world_model.dynamics.trees import combined, mapped
+from services.world_model.dynamics.tensor_trees import combined, mapped
 from services.world_model.network.codecs import to_uint8
 from services.world_model.network.configuration import Precision
 from services.world_model.network.flow_matching import (
@@ -35,8 +35,8 @@ from services.world_model.network.model import (
     Sampling,
     products_in,
 )
-from services.world_model.training.dataset import WindowBatch
 from services.world_model.training.distribution import ALONE, Processes
+from services.world_model.training.joint_dataset import WindowBatch
 
 TouchLoss = Literal["all", "contact_or_changing"]
 # A taxel that differs by this much from the step before is changing.

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from dextouch.data_folder import is_system_file
-from dextouch.episodes.care.deletion_records import take_start
 from dextouch.episodes.files import MAX_METADATA_BYTES, disk_errors
 from dextouch.episodes.format import ATTRIBUTES_KEY, COMMIT_FILE, METADATA_FILE
+from dextouch.episodes.maintenance.deletion_records import take_start
 from dextouch.episodes.spool_log import RECORDING_FILE
-from dextouch.episodes.stages import STAGING
+from dextouch.episodes.staging import STAGING
 from dextouch.episodes.trash import HOMES, NOTES_FILE, REVIEW_FILE, TRASH
 
 # Folders of a store and the kind of group in each.

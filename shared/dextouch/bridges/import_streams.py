@@ -12,8 +12,10 @@ from typing import Final
 import numpy as np
 from pydantic import ValidationError
 
-from dextouch.bridges.exporting import Block
-from dextouch.bridges.foreign import (
+from dextouch.bridges.export_files import Block
+from dextouch.bridges.import_images import Losses, Video, VideoDecoder, check_pixels
+from dextouch.bridges.import_messages import GROUP, VIDEO_UNIT, CameraModel, Form, Item
+from dextouch.bridges.import_recording import (
     ForeignStream,
     ImportAttributes,
     ImportReport,
@@ -22,8 +24,6 @@ from dextouch.bridges.foreign import (
     stream_names,
     write_recording,
 )
-from dextouch.bridges.foreign_images import Losses, Video, VideoDecoder, check_pixels
-from dextouch.bridges.foreign_messages import GROUP, VIDEO_UNIT, CameraModel, Form, Item
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import (
     CorruptDataError,

@@ -11,10 +11,10 @@ from safetensors import safe_open
 from dextouch.errors import InvalidInputError
 from services.world_model.checkpoints import METADATA_KEY, read_checkpoint
 from services.world_model.training import evaluation
-from services.world_model.training.dataset import WindowPosition, stack_windows
 from services.world_model.training.episode_sets import check_disjoint
 from services.world_model.training.evaluation import evaluate_prediction, predict_all
-from services.world_model.training.trainer import TrainingRun, train, train_on
+from services.world_model.training.joint_dataset import WindowPosition, stack_windows
+from services.world_model.training.joint_trainer import TrainingRun, train, train_on
 from tests.unit.world_model.conftest import losses
 
 
