@@ -23,7 +23,7 @@ from services.pipelines.study import demonstrator
 from services.twin.stage import ELSEWHERE, HOLD, RETREAT, script_name
 from services.twin.tasks import get_task
 from services.world_model.command_line import run_train
-from services.world_model.settings import default_checkpoint
+from services.world_model.shipped_checkpoints import default_checkpoint
 from services.world_model.world import open_world
 
 MODEL = "world_model"

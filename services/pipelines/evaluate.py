@@ -31,7 +31,7 @@ from services.evaluation.success_classifier import SuccessClassifier
 from services.pipelines.imagined_data import WORLD, refuse_trained_episodes, served_world
 from services.pipelines.parsers import prediction_parser, recorded_parser
 from services.world_model.network.model import Sampling
-from services.world_model.settings import default_checkpoint
+from services.world_model.shipped_checkpoints import default_checkpoint
 from services.world_model.world import open_world
 
 _HORIZONS: dict[str, Callable[[EpisodeReader], list[Scene]]] = {

@@ -26,7 +26,7 @@ from services.twin.names import (
     TAKE_PATHS,
     TASK_SETS,
 )
-from services.world_model.settings import default_checkpoint
+from services.world_model.shipped_checkpoints import default_checkpoint
 
 # Descriptions and examples by command.
 _WORDS = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))

@@ -48,7 +48,7 @@ from services.pipelines.parsers import study_parser
 from services.pipelines.training_data import stage_of
 from services.twin.stage import scripted_actions
 from services.world_model.checkpoints import is_state_checkpoint, read_state_checkpoint
-from services.world_model.settings import default_checkpoint
+from services.world_model.shipped_checkpoints import default_checkpoint
 
 # Chosen: a block opens its worlds anew, in some ten seconds, and plays all policies from these.
 _STARTS_IN_A_BLOCK = 10

@@ -28,7 +28,7 @@ def open_named(kind: str, value: str) -> World[Any]:
         return TwinWorld(TwinSettings())
     import torch
 
-    from services.world_model.settings import default_checkpoint
+    from services.world_model.shipped_checkpoints import default_checkpoint
     from services.world_model.world import open_world
 
     torch.set_num_threads(1)

@@ -37,22 +37,7 @@ from services.world_model.network.configuration import (
     WanFiles,
 )
 from services.world_model.presets import PRESETS
-
-# Checkpoints that ship with the package.
-PRETRAINED = Path(__file__).parent / "pretrained"
-STATE_MODEL, PAPER_FORM = "state.safetensors", "tiny.safetensors"
-
-
-def default_checkpoint() -> Path:
-    """Default checkpoint of the package: the state model if it is installed."""
-    state = PRETRAINED / STATE_MODEL
-    return state if state.is_file() else paper_form_checkpoint()
-
-
-def paper_form_checkpoint() -> Path:
-    """Checkpoint of the joint flow-matching model that ships with the package."""
-    return PRETRAINED / PAPER_FORM
-
+from services.world_model.shipped_checkpoints import PRETRAINED, default_checkpoint
 
 Output = Annotated[Path, Field(description="checkpoint to write")]
 DisjointTasks = Annotated[

@@ -12,7 +12,8 @@ from services.world_model.joint_world import JointWorld
 from services.world_model.network.codecs import WanVideoCodec
 from services.world_model.network.model import Sampling
 from services.world_model.predicted_world import SceneReader
-from services.world_model.settings import Placement, default_checkpoint
+from services.world_model.settings import Placement
+from services.world_model.shipped_checkpoints import default_checkpoint
 from services.world_model.state_world import StateWorld
 
 

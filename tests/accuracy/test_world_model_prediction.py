@@ -12,7 +12,7 @@ from services.twin.episodes import TakeOptions, record, write_episode
 from services.twin.settings import TwinSettings
 from services.twin.stage import Stage
 from services.world_model.checkpoints import read_checkpoint
-from services.world_model.settings import paper_form_checkpoint
+from services.world_model.shipped_checkpoints import paper_form_checkpoint
 from services.world_model.training.evaluation import evaluate_prediction, predict_all
 from services.world_model.training.joint_dataset import EpisodeArrays, WindowPosition, load_episodes
 

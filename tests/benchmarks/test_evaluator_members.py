@@ -5,7 +5,7 @@ import pytest
 from benchmarks.evaluator.work import single_member, write_single_members
 from dextouch.errors import CorruptDataError
 from services.world_model.checkpoints import write_state_checkpoint
-from services.world_model.settings import PRETRAINED
+from services.world_model.shipped_checkpoints import PRETRAINED
 from services.world_model.state_world import StateWorld
 from services.world_model.world import open_world
 from tests.contracts.test_world import from_observation, move, untrained_state_checkpoint

@@ -34,7 +34,7 @@ from services.evaluation.prediction_scenes import warp_over_table
 from services.evaluation.settings import DEFAULT_PROBE
 from services.twin.settings import TwinSettings
 from services.twin.world import TwinWorld
-from services.world_model.settings import PRETRAINED
+from services.world_model.shipped_checkpoints import PRETRAINED
 
 TINY = PRETRAINED / "tiny.safetensors"
 

@@ -10,7 +10,7 @@ import sys
 import numpy as np
 import PIL
 import torch
-from dextouch_services.world_model.settings import (
+from dextouch_services.world_model.shipped_checkpoints import (
     default_checkpoint,
     paper_form_checkpoint,
 )

@@ -17,7 +17,7 @@ from dextouch.worlds import WorldServiceSettings, create_world_app
 from services.cli import main
 from services.twin.settings import TwinSettings
 from services.twin.world import twin_worlds
-from services.world_model.settings import paper_form_checkpoint
+from services.world_model.shipped_checkpoints import paper_form_checkpoint
 from services.world_model.state_world import StateWorld
 from services.world_model.world import open_world
 from tests.contracts.test_world import untrained_state_checkpoint

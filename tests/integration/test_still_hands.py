@@ -15,7 +15,7 @@ from services.twin.tasks import EVALUATED
 from services.twin.world import TwinWorld
 from services.world_model.checkpoints import read_state_checkpoint
 from services.world_model.dynamics.model import REST_LATENTS
-from services.world_model.settings import PRETRAINED
+from services.world_model.shipped_checkpoints import PRETRAINED
 from services.world_model.state_world import StateWorld
 
 CAMERA = "camera_head"

@@ -11,7 +11,7 @@ from services.evaluation.prediction import DEFAULT_BASELINES, MODEL
 from services.twin.episodes import TakeOptions, record, write_episode
 from services.twin.settings import TwinSettings
 from services.twin.stage import Stage
-from services.world_model.settings import paper_form_checkpoint
+from services.world_model.shipped_checkpoints import paper_form_checkpoint
 
 pytestmark = pytest.mark.long
 

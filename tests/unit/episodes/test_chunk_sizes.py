@@ -8,7 +8,7 @@ import pytest
 import zstandard
 from pydantic import ValidationError
 
-from dextouch.episodes import files, stages, stream_arrays
+from dextouch.episodes import files, staging, stream_arrays
 from dextouch.episodes.files import MAX_METADATA_BYTES
 from dextouch.episodes.format import (
     CommitRecord,
@@ -196,7 +196,7 @@ def test_the_record_of_half_a_day_of_three_cameras_can_be_read():
     arrays = {name: one for each in streams for name, one in with_checksums(each, 12)}
     whole = CommitRecord(kind="recording", id="x", attributes_sha256="0", arrays=arrays)
     assert len(encode_commit(whole)[0]) > MAX_METADATA_BYTES
-    data = stages.encoded_record(whole)
+    data = staging.encoded_record(whole)
     assert len(data) <= MAX_METADATA_BYTES
     kept = decode_commit(data, what="x")[0].arrays
     assert {name: one.shape for name, one in kept.items()} == {
@@ -208,7 +208,7 @@ def test_the_record_of_half_a_day_of_three_cameras_can_be_read():
 
 def test_a_record_without_checksums_is_read_and_verified(store, monkeypatch):
     """A storage chunk a sample makes a long take of a short one."""
-    monkeypatch.setattr(stages, "MAX_METADATA_BYTES", 50_000)
+    monkeypatch.setattr(staging, "MAX_METADATA_BYTES", 50_000)
     stamps_ns = np.arange(3000) * 10**9
     with store.writer(kind="recording", attributes=take(stream((), rate_hz=1))) as one:
         one.append("raw", values=stamps_ns / 1e9, t_host_ns=stamps_ns)
@@ -221,7 +221,7 @@ def test_a_record_without_checksums_is_read_and_verified(store, monkeypatch):
 
 
 def test_what_could_not_be_read_again_is_not_committed(store, made, monkeypatch):
-    monkeypatch.setattr(stages, "MAX_METADATA_BYTES", 1000)
+    monkeypatch.setattr(staging, "MAX_METADATA_BYTES", 1000)
     with pytest.raises(StorageError, match="expected at most 1000 each"):
         made.write(store)
     assert store.list() == []

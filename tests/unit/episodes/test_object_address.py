@@ -53,7 +53,7 @@ def test_options_that_do_not_fit():
 
 def test_without_the_library_the_message_says_what_to_install(monkeypatch):
     for name in list(sys.modules):
-        if name.startswith(("obstore", "dextouch.episodes.object_")):
+        if name.startswith(("obstore", "dextouch.episodes.s3_", "dextouch.episodes.bucket_")):
             monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "obstore", None)
     with pytest.raises(UnavailableError, match=r"needs obstore; run `.*pip install .*\[s3\]"):

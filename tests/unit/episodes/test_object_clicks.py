@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from dextouch.episodes import EpisodeStore, ObjectTrack, care, clicked_poses
+from dextouch.episodes import EpisodeStore, ObjectTrack, clicked_poses, maintenance
 from dextouch.errors import InvalidInputError, NotFoundError, UnknownNameError
 from dextouch.geometry import transform_from_pose
 from dextouch.schemas import EpisodeClicks, ObjectClicks
@@ -198,7 +198,7 @@ def test_clicks_are_kept_beside_the_content(store):
     store.set_clicks("take", clicks())
     assert store.clicks("take") == clicks()
     assert store.open("take").verify().content_sha256 == before
-    assert not care.inspect_group(store.files("take"), "episode").findings
+    assert not maintenance.inspect_group(store.files("take"), "episode").findings
     store.delete("take")
     store.restore("take")
     assert store.clicks("take") == clicks()

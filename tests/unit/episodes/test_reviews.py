@@ -4,7 +4,7 @@ from datetime import UTC, datetime
 
 import pytest
 
-from dextouch.episodes import EpisodeStore, care, is_rejected
+from dextouch.episodes import EpisodeStore, is_rejected, maintenance
 from dextouch.errors import CorruptDataError
 from dextouch.schemas import Review
 from tests.unit.episode_store.episodes import write_episode, write_recording, write_take
@@ -36,7 +36,7 @@ def test_a_review_goes_to_the_trash_and_back(store):
 def test_a_review_is_no_foreign_file(store):
     write_episode(store, "a")
     store.set_review("a", ACCEPTED)
-    assert not care.inspect_group(store.files("a"), "episode").findings
+    assert not maintenance.inspect_group(store.files("a"), "episode").findings
 
 
 @pytest.mark.parametrize("content", ["{", '{"verdict": "liked"}'])

@@ -7,8 +7,8 @@ import pytest
 
 from dextouch.episodes import (
     EpisodeStore,
-    care,
     is_rejected,
+    maintenance,
 )
 from dextouch.episodes.editing import (
     EditOptions,
@@ -164,12 +164,12 @@ def test_what_is_salvaged_of_an_edit_is_superseded_or_supersedes(store, salvaged
     write_episode(store, "a", num_steps=20)
     trim_episode(store, "a", (1, 20), options=KEPT)
     damage(store, salvaged)
-    new_id = care.repair_group(store.root, "episode", salvaged).new_id
+    new_id = maintenance.repair_group(store.root, "episode", salvaged).new_id
     assert chosen(store) == ["a-trimmed-1" if salvaged == "a" else new_id]
     write_episode(store, "b")
     store.set_review("b", REJECTED)
     damage(store, "b")
-    assert store.review(care.repair_group(store.root, "episode", "b").new_id) == REJECTED
+    assert store.review(maintenance.repair_group(store.root, "episode", "b").new_id) == REJECTED
 
 
 def damage(store, name):

@@ -14,7 +14,7 @@ from dextouch.errors import (
     NotFoundError,
 )
 from services.networks.weight_files import read_weights
-from services.world_model import checkpoints, settings
+from services.world_model import checkpoints, shipped_checkpoints
 from services.world_model.checkpoints import (
     METADATA_KEY,
     CheckpointMetadata,
@@ -22,7 +22,8 @@ from services.world_model.checkpoints import (
     read_checkpoint,
     write_checkpoint,
 )
-from services.world_model.settings import WorldModelSettings, default_checkpoint
+from services.world_model.settings import WorldModelSettings
+from services.world_model.shipped_checkpoints import default_checkpoint
 
 
 @pytest.fixture
@@ -159,7 +160,7 @@ def test_checkpoints_are_listed_with_their_digests(tmp_path, tiny_model, metadat
 
 
 def test_the_default_is_the_state_model_where_it_is_there(tmp_path, monkeypatch):
-    monkeypatch.setattr(settings, "PRETRAINED", tmp_path)
+    monkeypatch.setattr(shipped_checkpoints, "PRETRAINED", tmp_path)
     (tmp_path / "tiny.safetensors").touch()
     assert default_checkpoint() == WorldModelSettings().checkpoint == tmp_path / "tiny.safetensors"
     (tmp_path / "state.safetensors").touch()

@@ -8,7 +8,8 @@ from services.world_model.checkpoints import Checkpoint, dropout_shares, write_c
 from services.world_model.command_line import open_by_digest
 from services.world_model.network.inputs import build_inputs
 from services.world_model.network.model import Sampling
-from services.world_model.settings import Placement, WorldModelSettings, paper_form_checkpoint
+from services.world_model.settings import Placement, WorldModelSettings
+from services.world_model.shipped_checkpoints import paper_form_checkpoint
 from services.world_model.training.joint_objective import LossOptions
 from services.world_model.world import open_world
 from tests.unit.world_model.conftest import losses

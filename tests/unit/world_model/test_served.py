@@ -11,7 +11,8 @@ from dextouch.schemas import StartRequest, decode_answer, encode_start
 from dextouch.worlds import create_world_app
 from services.world_model.command_line import open_by_digest
 from services.world_model.joint_world import JointWorld
-from services.world_model.settings import PAPER_FORM, PRETRAINED, STATE_MODEL, WorldModelSettings
+from services.world_model.settings import WorldModelSettings
+from services.world_model.shipped_checkpoints import PAPER_FORM, PRETRAINED, STATE_MODEL
 from tests.unit.world_model.test_joint_world import make_start
 
 FLOAT64 = {"content-type": "application/octet-stream; dtype=float64"}

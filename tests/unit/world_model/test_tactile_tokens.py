@@ -18,7 +18,7 @@ from services.world_model.network.model import (
     stack_noise,
 )
 from services.world_model.network.tactile import build_tokenizer
-from services.world_model.settings import paper_form_checkpoint
+from services.world_model.shipped_checkpoints import paper_form_checkpoint
 from services.world_model.training.joint_dataset import WindowPosition, WindowSampler
 from tests.unit.world_model.conftest import losses
 

@@ -11,7 +11,7 @@ from services.world_model.checkpoints import read_state_checkpoint
 from services.world_model.network.configuration import RendererConfig
 from services.world_model.rendering.inputs import PreparedScenes
 from services.world_model.rendering.renderer import Renderer, RendererNetwork
-from services.world_model.settings import PRETRAINED
+from services.world_model.shipped_checkpoints import PRETRAINED
 from tests.unit.world_model.rendering.scene_by_hand import (
     BOXES_M,
     K,

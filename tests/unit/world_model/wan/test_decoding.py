@@ -8,7 +8,8 @@ from dextouch.errors import InvalidInputError
 from services.world_model.network.codecs import WanVideoCodec, last_images
 from services.world_model.network.configuration import SPATIAL_FACTOR, NetworkConfig, WanConfig
 from services.world_model.plan import plan_of
-from services.world_model.settings import Placement, paper_form_checkpoint
+from services.world_model.settings import Placement
+from services.world_model.shipped_checkpoints import paper_form_checkpoint
 from services.world_model.world import open_world
 from tests.unit.world_model.wan.conftest import shaken
 
