@@ -33,6 +33,7 @@ logger = structlog.get_logger(__name__)
 
 Attributes = Annotated[schemas.NewRecording, Depends(JsonBody(schemas.NewRecording))]
 Finish = Annotated[schemas.FinishRecording, Depends(JsonBody(schemas.FinishRecording))]
+Status = schemas.RecordingStatus
 # Room for the calibration and descriptors of a station, the ledger of a take, or names of items.
 MAX_ATTRIBUTES_BYTES = 256 * KIB
 MAX_NOTE_BYTES = 16 * KIB
@@ -57,7 +58,7 @@ def uploads_router(
 
     @router.post("/recordings", status_code=201, tags=["recordings"], dependencies=[MAY_WRITE])
     @takes({JSON: MAX_ATTRIBUTES_BYTES})
-    def create_recording(given: Attributes, sender: Writer) -> schemas.RecordingStatus:
+    def create_recording(given: Attributes, sender: Writer) -> Status:
         """Begin an upload, or return the status of an existing one."""
         attributes = given.attributes()
         sender.check_station(attributes.station)
@@ -108,9 +109,7 @@ def uploads_router(
 
     @router.post("/recordings/{recording_id}/finish", tags=["recordings"], dependencies=[MAY_WRITE])
     @takes({JSON: MAX_ATTRIBUTES_BYTES})
-    def finish_recording(
-        recording_id: str, body: Finish, sender: Writer
-    ) -> schemas.RecordingStatus:
+    def finish_recording(recording_id: str, body: Finish, sender: Writer) -> Status:
         """Commit a complete upload."""
         started = time.perf_counter()
         with metrics.counting_refusals(), _unless(partial(ingest.is_finished, recording_id)):
@@ -121,7 +120,7 @@ def uploads_router(
         return status
 
     @router.get("/recordings/{recording_id}", tags=["recordings"], dependencies=[MAY_READ])
-    def get_recording(recording_id: str, sender: Reader) -> schemas.RecordingStatus:
+    def get_recording(recording_id: str, sender: Reader) -> Status:
         """Status of an upload, for those who may continue it, or of a finished recording."""
         return ingest.status(recording_id, sender)
 

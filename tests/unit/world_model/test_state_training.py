@@ -1,15 +1,12 @@
 """Start readers and cores learn a toy scene: a bright block that a descending hand presses."""
 
 import dataclasses
-import subprocess
-import sys
 from collections import Counter
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from scipy.ndimage import distance_transform_edt
 
 from dextouch.episodes import ObjectTrack, split_by_scene
 from dextouch.errors import InvalidInputError
@@ -17,7 +14,6 @@ from dextouch.geometry import apply, invert, pinhole_matrix, project, transform
 from dextouch.hands.actions import IDENTITY_POSE_9D, POSE_SLICES, AnchorPoses
 from dextouch.schemas import MAX_OBJECTS, EpisodeAttributes, StoredAnchor, matrix_rows
 from dextouch.serving import load_settings
-from dextouch.tactile import DEXTOUCH_V1
 from services.world_model.checkpoints import StateBounds
 from services.world_model.dynamics.core import RecurrentCore, SceneStart
 from services.world_model.dynamics.features import SLOT_SIZE, DynamicsConfig, TouchCodec
@@ -45,7 +41,6 @@ from services.world_model.training.evaluation import evaluate_dynamics
 from services.world_model.training.reader_training import read_step, reader_errors, train_reader
 from services.world_model.training.scene_table import (
     SceneTable,
-    _nearest_measured,
     scene_table,
     vocabulary,
 )
@@ -599,21 +594,3 @@ def test_a_core_feels_the_size_that_was_read(config, table):
     torch.testing.assert_close(doubled[..., at : at + 6], 2 * usual[..., at : at + 6])
     # The first point's distance to it.
     assert (doubled[..., 0, 0] < usual[..., 0, 0]).all()
-
-
-def test_unmeasured_taxels_are_filled_from_the_nearest_ones_as_scipy_finds_them():
-    measured = np.random.default_rng(0).random(320) < 0.2
-    nearest = _nearest_measured(measured, DEXTOUCH_V1)
-    assert measured[nearest].all()
-    for pad in (pad for stack in DEXTOUCH_V1.split(np.arange(320)) for pad in stack):
-        rows, columns = np.indices(pad.shape)
-        found = np.searchsorted(pad.ravel(), nearest[pad])
-        off = np.hypot(found // pad.shape[1] - rows, found % pad.shape[1] - columns)
-        np.testing.assert_allclose(off, distance_transform_edt(~measured[pad]))
-
-
-@pytest.mark.long
-def test_training_needs_no_scipy_which_the_extra_model_lacks():
-    module = "services.world_model.training.state_trainer"
-    code = f"import sys; sys.modules['scipy'] = None; import {module}"
-    subprocess.run([sys.executable, "-c", code], check=True)
