@@ -32,7 +32,7 @@ from services.twin.stage import Actions, script_name, scripted_actions
 from services.twin.tasks import EVALUATED, named_tasks
 from services.twin.world import TwinWorld
 from services.world_model.checkpoints import read_state_checkpoint
-from services.world_model.settings import default_checkpoint
+from services.world_model.shipped_checkpoints import default_checkpoint
 from services.world_model.state_world import StateWorld
 
 FIRST_SEED = 45_000

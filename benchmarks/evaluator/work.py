@@ -62,7 +62,7 @@ from services.twin.stage import (
 from services.twin.world import TwinWorld
 from services.world_model.checkpoints import read_state_checkpoint, write_state_checkpoint
 from services.world_model.dynamics.model import DynamicsModel
-from services.world_model.settings import default_checkpoint
+from services.world_model.shipped_checkpoints import default_checkpoint
 from services.world_model.world import open_world
 
 

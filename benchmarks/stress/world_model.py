@@ -15,7 +15,7 @@ from services.world_model.joint_world import JointWorld
 from services.world_model.network.flow_matching import add_noise, sample, shift_time
 from services.world_model.network.inputs import PredictionRequest, build_inputs
 from services.world_model.network.model import JointWorldModel, stack_noise
-from services.world_model.settings import paper_form_checkpoint
+from services.world_model.shipped_checkpoints import paper_form_checkpoint
 
 STAGE = StageCells("world-model")
 # Bounds of the current model in bfloat16; its own touch error is larger.

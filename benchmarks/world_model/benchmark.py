@@ -30,7 +30,7 @@ from services.world_model.checkpoints import read_checkpoint, read_state_checkpo
 from services.world_model.joint_world import JointWorld
 from services.world_model.network.configuration import Precision, Sampler
 from services.world_model.network.model import Sampling
-from services.world_model.settings import PRETRAINED, STATE_MODEL, paper_form_checkpoint
+from services.world_model.shipped_checkpoints import PRETRAINED, STATE_MODEL, paper_form_checkpoint
 from services.world_model.state_world import StateWorld
 
 
