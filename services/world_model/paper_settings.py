@@ -324,6 +324,21 @@ class TrainCommand(CommandSettings, TrainSettings):
         return (*given, PresetSource(settings_cls))
 
 
+class CacheCommand(TrainCommand):
+    """Encode the images of a training once, before it, so that it never runs the video encoder.
+
+    Give it the flags of that training, which then reads the same file. What is there already is
+    not computed again, so that it can be interrupted, and new episodes can be added. A training
+    keeps what it does not find there, too.
+
+    Example:
+      dextouch train cache --preset wan22-5b --wan.folder models/Wan2.2-TI2V-5B-Diffusers \
+        --episodes runs/episodes --wan.latent-cache runs/latents.sqlite3 --wan.text-cache runs/texts
+    """
+
+    model_config = service_config("world_model_cache", "dextouch train cache")
+
+
 class AdaptCommand(CommandSettings, AdaptationSettings, FromCheckpointSettings):
     """Adapt a world model of the paper's form to new tasks, from robot and human episodes.
 

@@ -42,6 +42,7 @@ from services.world_model.training.joint_objective import (
     examples_of,
     own_context,
 )
+from services.world_model.training.latent_cache import use_latent_cache
 from services.world_model.training.tokenizer_trainer import check_unseen, with_tokenizer
 
 LOG_EVERY_STEPS = 20  # rows of a report's `log`, kept for resumed runs, too
@@ -513,6 +514,8 @@ def _run_or_resume(
             )
     elif ancestor is None:
         run.fit_codecs(None if tokenizer is None else tokenizer.tokenizer)
+    # Images that the model itself drew come once only.
+    use_latent_cache(run.model, settings.wan, adds=not settings.self_forcing)
     kept_s = run.budget.wall_s
 
     def keep(now: TrainingRun) -> None:
