@@ -169,7 +169,9 @@ class _LimitedWebSocket(_Watched, WebSocketsSansIOProtocol):
     def data_received(self, data: bytes) -> None:
         super().data_received(data)
         buffered = len(self.conn.reader.buffer)
-        unfinished = buffered + len(self._begun) + sum(len(frame) for frame in self.frames)
+        unfinished = buffered + len(self._begun) + sum(map(len, self.frames))
+        if unfinished == self._unfinished_bytes:
+            return
         # Only what is of a message counts: pings could be sent for ever.
         if not self.transport.get_write_buffer_size():
             self._moved_bytes += max(0, unfinished - self._unfinished_bytes)

@@ -29,6 +29,7 @@ DTYPES = ("uint8", "uint16", "int32", "int64", "float32", "float64", "bool")
 _NAMES = {np.dtype(name).newbyteorder("<"): name for name in DTYPES}
 # Kinds of dtypes of openpi that are read, bool, signed, unsigned and floating, and their names.
 _KINDS: Final = "biuf"
+_NUMPY: Final = (np.ndarray, np.generic)
 _DTYPE: Final = re.compile(r"[<>|=]?(b1|[iu][1248]|f[248])")
 C = TypeVar("C", bound=Sized)
 
@@ -174,7 +175,7 @@ def unpack_openpi(data: bytes, *, max_bytes: int) -> dict[str, Any]:
 
 
 def _encoded(value: object) -> dict[bytes, Any]:
-    if not isinstance(value, np.ndarray | np.generic) or value.dtype.kind not in _KINDS:
+    if not isinstance(value, _NUMPY) or value.dtype.kind not in _KINDS:
         raise TypeError(f"got {type(value).__name__}, expected plain values and numeric arrays")
     if isinstance(value, np.generic):
         return {b"__npgeneric__": True, b"data": value.item(), b"dtype": value.dtype.str}

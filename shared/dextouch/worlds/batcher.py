@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Float64
@@ -21,8 +21,7 @@ ResultT = TypeVar("ResultT")
 SteppedBatch = tuple[float, float, list[tuple[SteppedRollout[State], bytes]]]
 
 
-@dataclass(frozen=True)
-class StepOutcome(Generic[State]):
+class StepOutcome(NamedTuple, Generic[State]):
     """Result of a step, its serialized state, and timings."""
 
     stepped: SteppedRollout[State]
@@ -31,18 +30,16 @@ class StepOutcome(Generic[State]):
     device_s: float
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class StepJob(Generic[State]):
-    """One rollout's next chunk, and what of its observation is wanted; made in the event loop."""
+    """One rollout's next chunk, and what of its observation is wanted; only a queued one waits."""
 
     state: State
     actions: Float64[np.ndarray, "steps 67"]
     seed: int
     selector: ReturnSelector = EVERYTHING
     since_s: float = field(default_factory=time.perf_counter, init=False)
-    outcome: "asyncio.Future[StepOutcome[State]]" = field(
-        default_factory=lambda: asyncio.get_running_loop().create_future(), init=False
-    )
+    outcome: "asyncio.Future[StepOutcome[State]]" = field(init=False)
 
 
 def batch_histogram() -> Histogram:
@@ -103,6 +100,7 @@ class WorldWorker(Generic[State]):
                 f"expected at most {self.max_waiting}; try again",
                 retry_after_s=1,
             )
+        job.outcome = asyncio.get_running_loop().create_future()
         self._waiting.append(job)
         if not self._is_stepping:
             self._step_next()

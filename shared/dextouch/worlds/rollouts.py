@@ -10,7 +10,6 @@ import time
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from contextlib import AbstractAsyncContextManager
-from dataclasses import replace
 from typing import Any
 from weakref import WeakValueDictionary
 
@@ -265,7 +264,7 @@ class RolloutService:
         info = parent.info.model_copy(update=changed)
         async with self._place(info.id) as placed:
             begun_host_ns, trace_id = time.time_ns(), current_trace_id()
-            note = replace(parent.note, key=owner, begun_host_ns=begun_host_ns, trace_id=trace_id)
+            note = parent.note._replace(key=owner, begun_host_ns=begun_host_ns, trace_id=trace_id)
             record = RolloutRecord(info, parent.snapshot, None, parent.payload, placed, note)
             await self._records.write(record)
         logger.info("rollout_forked", rollout_id=info.id, parent_id=rollout_id)
@@ -335,7 +334,7 @@ class RolloutService:
         """Mark a rollout as ended; returns the error that later chunks get."""
         info = record.info.model_copy(update={"ended": error.reason})
         stored = await self._records.read(info.id)
-        await self._records.write(replace(stored, info=info, version=record.version))
+        await self._records.write(stored._replace(info=info, version=record.version))
         self._live.pop(info.id, None)
         logger.info("rollout_ended", rollout_id=info.id, reason=error.reason)
         return ended_error(info)
