@@ -284,7 +284,8 @@ class _LimitedHttp(_Watched, HttpToolsProtocol):
         self._moved_bytes += len(data)
         super().data_received(data)
         # The parser keeps a header to itself until its end.
-        if self._is_receiving and not self._is_refused:
+        too_many = self._received_bytes > MAX_HEADER_BYTES
+        if too_many and self._is_receiving and not self._is_refused:
             with suppress(HttpParserError):
                 self._check_headers(self._received_bytes)
 
@@ -494,12 +495,9 @@ class RequestMiddleware:
                 duration_s = time.perf_counter() - started
                 timings = [f"{part};dur={spent_s * 1e3:.2f}" for part, spent_s in timings_s.items()]
                 timings.append(f"total;dur={duration_s * 1e3:.2f}")
+                headers = [one for one in message.get("headers", ()) if one[0] not in OWN_HEADERS]
                 message["headers"] = [
-                    *(
-                        header
-                        for header in message.get("headers", ())
-                        if header[0] not in OWN_HEADERS
-                    ),
+                    *headers,
                     (b"x-request-id", request_id.encode()),
                     (b"server-timing", ", ".join(timings).encode()),
                 ]
@@ -512,10 +510,10 @@ class RequestMiddleware:
                 )
             await send(message)
 
-        with traced(scope) as trace_id:
-            scope["state"]["trace_id"] = trace_id
+        with traced(scope) as span:
+            scope["state"]["trace_id"] = span.trace_id
             tokens = structlog.contextvars.bind_contextvars(
-                request_id=request_id, trace_id=trace_id
+                request_id=request_id, trace_id=span.trace_id
             )
             try:
                 await self._app(scope, receive, send_with_headers)

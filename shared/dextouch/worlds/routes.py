@@ -45,6 +45,7 @@ from dextouch.serving import (
     AccessControl,
     RequireScope,
     decoded,
+    header,
     media_type,
     takes,
     timed,
@@ -67,7 +68,9 @@ MAX_WATCHED: Final = 200  # chosen: a list that people read
 REPLAYED_HEADER: Final = "dextouch-replayed"
 DTYPES: Final = ("float32", "float64")
 _PATH: Final = re.compile(r"/v1/rollouts/([^/]+)/chunks/([0-9]{1,9})")
-_DTYPE_OF: Final = {f"{OCTETS}; dtype={dtype}".encode(): dtype for dtype in DTYPES}
+_DTYPE_OF: Final = {f"{OCTETS}; dtype={dtype}": dtype for dtype in DTYPES}
+_REPLAYED, _COMPUTED = ((REPLAYED_HEADER.encode(), value) for value in (b"true", b"false"))
+_CONTENT_TYPE: Final = (b"content-type", MSGPACK.encode())
 _MAX_QUERIES: Final = 64  # chosen: clients use a few
 _MAX_QUERY_BYTES: Final = 256  # chosen: cameras and options fit
 
@@ -143,17 +146,15 @@ class ChunkShortcut:
         place = _PATH.fullmatch(scope["path"])
         if learned is None or place is None or scope["method"] != "POST":
             return None
-        # Of several headers of one name the first counts, as in Starlette.
-        headers = dict(scope["headers"][::-1])
-        dtype = _DTYPE_OF.get(headers.get(b"content-type", b""))
-        if dtype is None or wants_json(headers.get(b"accept", b"").decode("latin-1")):
+        dtype = _DTYPE_OF.get(header(scope, b"content-type") or "")
+        if dtype is None or wants_json(header(scope, b"accept") or ""):
             return None
         selector, scope["route"] = learned
         rollout_id, chunk = place[1], int(place[2])
 
         async def step(scope: Scope, receive: Receive, send: Send) -> None:
             access: AccessControl = scope["app"].state.access
-            access.check(headers.get(b"authorization", b"").decode("latin-1"), SCOPE)
+            access.check(header(scope, b"authorization"), SCOPE)
             body = await _body(receive)
             spent_s: dict[str, float] = scope["state"]["timings_s"]
             began_s = time.perf_counter()
@@ -163,12 +164,10 @@ class ChunkShortcut:
                 spent_s["decode"] = time.perf_counter() - began_s
             answer = await self._service.step(rollout_id, chunk, actions, selector)
             spent_s |= answer.spent_s
-            size = str(len(answer.payload)).encode()
-            replayed = b"true" if answer.replayed else b"false"
             answered = [
-                (REPLAYED_HEADER.encode(), replayed),
-                (b"content-length", size),
-                (b"content-type", MSGPACK.encode()),
+                _REPLAYED if answer.replayed else _COMPUTED,
+                (b"content-length", b"%d" % len(answer.payload)),
+                _CONTENT_TYPE,
             ]
             await send({"type": "http.response.start", "status": 200, "headers": answered})
             await send({"type": "http.response.body", "body": answer.payload})
