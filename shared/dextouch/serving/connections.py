@@ -8,7 +8,7 @@ import asyncio
 import re
 import secrets
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import cache, cached_property, partial
@@ -490,7 +490,7 @@ class RequestMiddleware:
         timings_s: dict[str, float] = {}
         scope.setdefault("state", {}).update(request_id=request_id, timings_s=timings_s)
 
-        async def send_with_headers(message: Message) -> None:
+        def send_with_headers(message: Message) -> Awaitable[None]:
             if message["type"] == "http.response.start":
                 duration_s = time.perf_counter() - started
                 timings = [f"{part};dur={spent_s * 1e3:.2f}" for part, spent_s in timings_s.items()]
@@ -508,7 +508,7 @@ class RequestMiddleware:
                 self._uncounted.add(
                     (scope["method"], route, message["status"], duration_s, parts_s)
                 )
-            await send(message)
+            return send(message)
 
         with traced(scope) as span:
             scope["state"]["trace_id"] = span.trace_id
@@ -523,11 +523,11 @@ class RequestMiddleware:
     async def _count_websocket(self, scope: Scope, receive: Receive, send: Send) -> None:
         opened: list[Gauge] = []
 
-        async def send_and_count(message: Message) -> None:
+        def send_and_count(message: Message) -> Awaitable[None]:
             if message["type"] == "websocket.accept":
                 opened.append(self._websockets.labels(scope["route"].path))
                 opened[0].inc()
-            await send(message)
+            return send(message)
 
         try:
             await self._app(scope, receive, send_and_count)

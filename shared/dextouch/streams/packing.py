@@ -45,7 +45,7 @@ def pack(fields: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> bytes:
             if dtype not in DTYPES:
                 raise InvalidInputError(f"array {name!r}: dtype {dtype}, expected one of {DTYPES}")
             ordered = ordered.astype(np.dtype(dtype).newbyteorder("<"))
-        packed[name] = {"dtype": dtype, "shape": list(ordered.shape), "data": ordered.data}
+        packed[name] = {"dtype": dtype, "shape": ordered.shape, "data": ordered.data}
     try:
         return msgpack.packb({"fields": dict(fields), "arrays": packed})
     except OverflowError as error:
@@ -132,7 +132,7 @@ def array_of(
     num_numbers = 1
     for n in counts or ():
         # Exactly int, since a bool is none.
-        num_numbers *= max(n, 1) if type(n) is int and n >= 0 else MAX_NUMBERS + 1
+        num_numbers *= n or 1 if type(n) is int and n >= 0 else MAX_NUMBERS + 1
     if counts is None or num_numbers > MAX_NUMBERS:
         raise InvalidInputError(
             f"{what}: shape {shape!r}, expected at most {MAX_DIMENSIONS} counts whose product is "

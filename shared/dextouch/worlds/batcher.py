@@ -2,7 +2,7 @@
 
 import asyncio
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -10,7 +10,6 @@ from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Float64
-from prometheus_client import Histogram
 
 from dextouch.errors import LimitExceededError, UnavailableError
 from dextouch.schemas import EVERYTHING, ReturnSelector
@@ -42,13 +41,6 @@ class StepJob(Generic[State]):
     outcome: "asyncio.Future[StepOutcome[State]]" = field(init=False)
 
 
-def batch_histogram() -> Histogram:
-    """A metric of batch sizes for the workers of a service, in no registry yet."""
-    name = "dextouch_batch_rollouts"
-    sizes = (1, 2, 4, 8, 16, 32)
-    return Histogram(name, "Rollouts of a batch.", ("world",), buckets=sizes, registry=None)
-
-
 class WorldWorker(Generic[State]):
     """One world, one thread, one queue; a quick world needs neither thread nor queue.
 
@@ -62,10 +54,10 @@ class WorldWorker(Generic[State]):
         *,
         max_waiting: int = 256,
         max_batch: int = 32,
-        on_batch: Callable[[float], object] | None = None,
     ) -> None:
         self.world = world
-        self._on_batch = on_batch
+        # How many batches had this many rollouts.
+        self.num_batches: Counter[int] = Counter()
         self.max_waiting = max_waiting
         self._max_batch = max_batch if isinstance(world, BatchWorld) else 1
         self._waiting: deque[StepJob[State]] = deque()
@@ -148,8 +140,7 @@ class WorldWorker(Generic[State]):
     def _step_all(self, jobs: Sequence[StepJob[State]]) -> SteppedBatch[State]:
         """Runs in the world's thread; returns start time, duration, steps and snapshots."""
         began_s = time.perf_counter()
-        if self._on_batch is not None:
-            self._on_batch(len(jobs))
+        self.num_batches[len(jobs)] += 1
         # The test of a protocol takes longer than a step may.
         if len(jobs) > 1 and isinstance(self.world, BatchWorld):
             stepped = self.world.step_batch(

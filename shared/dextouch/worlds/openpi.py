@@ -77,7 +77,7 @@ def openpi_router(service: RolloutService) -> APIRouter:
                 except DexTouchError as error:
                     await socket.send_text(error.message)
                 else:
-                    await socket.send_bytes(answer)
+                    await socket.send({"type": "websocket.send", "bytes": answer})
 
     return router
 

@@ -7,10 +7,10 @@ committed when its record replaces the version it was computed from (compare and
 import asyncio
 import hashlib
 import time
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from collections.abc import Callable, Mapping
 from contextlib import AbstractAsyncContextManager
-from typing import Any
+from typing import Any, Final
 from weakref import WeakValueDictionary
 
 import numpy as np
@@ -37,7 +37,7 @@ from dextouch.schemas import (
 from dextouch.serving import StateStore
 from dextouch.streams import pack
 from dextouch.tracing import current_trace_id
-from dextouch.worlds.batcher import StepJob, WorldWorker, batch_histogram
+from dextouch.worlds.batcher import StepJob, WorldWorker
 from dextouch.worlds.records import (
     Answer,
     RecordStore,
@@ -62,6 +62,7 @@ from dextouch.worlds.world import (
 
 logger = structlog.get_logger(__name__)
 
+_FLOAT64: Final = np.dtype("<f8")
 # Opens the world of this name and digest, or returns None where it is not to be had.
 Reopen = Callable[[str, str], World[Any] | None]
 
@@ -91,11 +92,7 @@ class RolloutService:
         self._reopen = reopen
         self._reopened: dict[tuple[str, str], WorldWorker[Any]] = {}
         self._reopening = asyncio.Lock()
-        self.batches = batch_histogram()
-        self._workers = {
-            name: WorldWorker(world, on_batch=self.batches.labels(name).observe)
-            for name, world in worlds.items()
-        }
+        self._workers = {name: WorldWorker(world) for name, world in worlds.items()}
         self._records = RecordStore(store, ttl_s=self.limits.ttl_s)
         # The newest states of this process's rollouts, least recently used first, with their
         # records, of which snapshot and payload are left out.
@@ -122,6 +119,14 @@ class RolloutService:
         return {
             name: (worker.num_waiting, worker.max_waiting) for name, worker in self._workers.items()
         }
+
+    def num_batches(self) -> dict[str, Counter[int]]:
+        """How many batches had how many rollouts, by world."""
+        reopened = [(name, worker) for (name, _), worker in self._reopened.items()]
+        found: dict[str, Counter[int]] = {}
+        for name, worker in (*self._workers.items(), *reopened):
+            found[name] = found.get(name, Counter()) + worker.num_batches.copy()
+        return found
 
     def drain(self) -> None:
         """Refuse new rollouts from now on."""
@@ -223,7 +228,7 @@ class RolloutService:
             check_selector(selector, description)
             checked = check_chunk(actions, description)
             digest = hashlib.sha256(selector_bytes(selector))
-            digest.update(np.ascontiguousarray(checked, dtype="<f8").data)
+            digest.update(np.ascontiguousarray(checked, dtype=_FLOAT64).data)
             sha256 = digest.hexdigest()
             replayed = record.replay(chunk, sha256)
             if replayed is not None:
@@ -327,8 +332,8 @@ class RolloutService:
         version = await self._records.write(record, parts[0]["rollout"])
         self._keep(RolloutRecord(info, b"", version=version, note=note), outcome.stepped.state)
         stored_s = time.perf_counter() - began_s - encoded_s
-        spent_s = {"queue": outcome.queued_s, "device": outcome.device_s}
-        return Answer(payload, parts, spent_s=spent_s | {"encode": encoded_s, "store": stored_s})
+        spent_s = {"queue": outcome.queued_s, "device": outcome.device_s, "encode": encoded_s}
+        return Answer(payload, parts, spent_s=spent_s | {"store": stored_s})
 
     async def _end(self, record: RolloutRecord, error: EndedError) -> EndedError:
         """Mark a rollout as ended; returns the error that later chunks get."""
@@ -382,8 +387,7 @@ class RolloutService:
             if began not in self._reopened and self._reopen is not None:
                 world = await asyncio.to_thread(self._reopen, *began)
                 if world is not None:
-                    observe = self.batches.labels(info.world).observe
-                    self._reopened[began] = WorldWorker(world, on_batch=observe)
+                    self._reopened[began] = WorldWorker(world)
                     logger.info("world_reopened", world=info.world, digest=info.world_digest)
         if began not in self._reopened:
             raise ConflictError(
