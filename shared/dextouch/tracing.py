@@ -10,8 +10,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, NamedTuple
 
 TRACEPARENT: Final = "traceparent"
 NOT_SAMPLED: Final = "00"
@@ -20,8 +19,7 @@ _FORM = re.compile(r"(?!ff)([0-9a-f]{2})-([0-9a-f]{32})-([0-9a-f]{16})-([0-9a-f]
 _current: ContextVar["TraceContext | None"] = ContextVar("trace_context", default=None)
 
 
-@dataclass(frozen=True)
-class TraceContext:
+class TraceContext(NamedTuple):
     """A span of a trace: ids in hexadecimal, and the flags of W3C (01 is sampled)."""
 
     trace_id: str
@@ -35,7 +33,7 @@ class TraceContext:
 
     def child(self) -> "TraceContext":
         """A new span of the same trace."""
-        return replace(self, span_id=secrets.token_hex(8))
+        return self._replace(span_id=secrets.token_hex(8))
 
 
 def new_trace(trace_id: str | None = None) -> TraceContext:

@@ -167,11 +167,11 @@ _FLOAT64: Final = np.dtype(np.float64)
 
 
 def check_observation_arrays(
-    *,
     images: Mapping[str, np.ndarray],
     tactile_kpa: np.ndarray,
     action_reached: np.ndarray,
     object_poses: np.ndarray | None = None,
+    *,
     where: str,
 ) -> None:
     """Check that the arrays of an observation are consistent and finite.

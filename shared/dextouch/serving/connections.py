@@ -287,14 +287,13 @@ class _LimitedHttp(_Watched, HttpToolsProtocol):
         too_many = self._received_bytes > MAX_HEADER_BYTES
         if too_many and self._is_receiving and not self._is_refused:
             with suppress(HttpParserError):
-                self._check_headers(self._received_bytes)
+                self._refuse_headers(self._received_bytes)
 
-    def _check_headers(self, num_bytes: int) -> None:
+    def _refuse_headers(self, num_bytes: int) -> None:
         """Refuse a request with too many bytes beside its body; the error ends its parsing."""
-        if num_bytes > MAX_HEADER_BYTES:
-            text = f"got {num_bytes} bytes of headers, expected at most {MAX_HEADER_BYTES}"
-            self._refuse(431, InvalidInputError(text))
-            raise HttpParserError(text)
+        text = f"got {num_bytes} bytes of headers, expected at most {MAX_HEADER_BYTES}"
+        self._refuse(431, InvalidInputError(text))
+        raise HttpParserError(text)
 
     def on_message_begin(self) -> None:
         super().on_message_begin()
@@ -303,12 +302,14 @@ class _LimitedHttp(_Watched, HttpToolsProtocol):
 
     def on_url(self, url: bytes) -> None:
         self._header_bytes += len(url)
-        self._check_headers(self._header_bytes)
+        if self._header_bytes > MAX_HEADER_BYTES:
+            self._refuse_headers(self._header_bytes)
         super().on_url(url)
 
     def on_header(self, name: bytes, value: bytes) -> None:
         self._header_bytes += len(name) + len(value) + NUM_SEPARATORS
-        self._check_headers(self._header_bytes)
+        if self._header_bytes > MAX_HEADER_BYTES:
+            self._refuse_headers(self._header_bytes)
         super().on_header(name, value)
 
     def on_headers_complete(self) -> None:
@@ -325,7 +326,7 @@ class _LimitedHttp(_Watched, HttpToolsProtocol):
         self._is_receiving = False
 
     def send_400_response(self, msg: str) -> None:
-        # Also called where `_check_headers` has answered.
+        # Also called where `_refuse_headers` has answered.
         if self._is_refused:
             return
         self._note_refusal(400, "no valid HTTP")
@@ -485,7 +486,7 @@ class RequestMiddleware:
             return
         started = time.perf_counter()
         given = header(scope, b"x-request-id") or ""
-        is_usable = REQUEST_ID.fullmatch(given) and masked(given) == given
+        is_usable = given and REQUEST_ID.fullmatch(given) and masked(given) == given
         request_id = given if is_usable else secrets.token_hex(16)
         timings_s: dict[str, float] = {}
         scope.setdefault("state", {}).update(request_id=request_id, timings_s=timings_s)

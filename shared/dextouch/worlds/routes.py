@@ -66,7 +66,7 @@ CLIENT_HEADER: Final = "dextouch-client"
 MAX_CLIENT_LETTERS: Final = 64  # chosen: a name in a list
 MAX_WATCHED: Final = 200  # chosen: a list that people read
 REPLAYED_HEADER: Final = "dextouch-replayed"
-DTYPES: Final = ("float32", "float64")
+DTYPES: Final[dict[str, np.dtype[Any]]] = {"float32": np.dtype("<f4"), "float64": np.dtype("<f8")}
 _PATH: Final = re.compile(r"/v1/rollouts/([^/]+)/chunks/([0-9]{1,9})")
 _DTYPE_OF: Final = {f"{OCTETS}; dtype={dtype}": dtype for dtype in DTYPES}
 _REPLAYED, _COMPUTED = ((REPLAYED_HEADER.encode(), value) for value in (b"true", b"false"))
@@ -353,10 +353,10 @@ def actions_from(body: bytes, dtype: str) -> Shaped[np.ndarray, "..."]:
             f"chunk: got dtype {dtype!r}, expected the header "
             f"'Content-Type: {OCTETS}; dtype=float32' or float64"
         )
-    row_bytes = ACTION_DIM * np.dtype(dtype).itemsize
+    row_bytes = ACTION_DIM * DTYPES[dtype].itemsize
     if not body or len(body) % row_bytes:
         raise ShapeError(
             f"chunk: got {len(body)} bytes, expected a multiple of {row_bytes} "
             f"([K, {ACTION_DIM}] {dtype}, little endian)"
         )
-    return np.frombuffer(body, np.dtype(dtype).newbyteorder("<")).reshape(-1, ACTION_DIM)
+    return np.frombuffer(body, DTYPES[dtype]).reshape(-1, ACTION_DIM)

@@ -263,13 +263,8 @@ def _check_fits(
     *,
     where: str,
 ) -> None:
-    check_observation_arrays(
-        images=observation.images,
-        tactile_kpa=observation.tactile_kpa,
-        action_reached=observation.action_reached,
-        object_poses=observation.object_poses,
-        where=where,
-    )
+    seen = observation.images, observation.tactile_kpa, observation.action_reached
+    check_observation_arrays(*seen, observation.object_poses, where=where)
     if (num_taxels := observation.tactile_kpa.shape[-1]) != description.num_taxels:
         layout = description.tactile_layout
         raise ShapeError(
