@@ -82,8 +82,9 @@ def action_names(*, has_robot_joints: bool = True) -> list[str]:
 
 
 def all_finite(array: np.ndarray) -> bool:
-    """Whether no number is NaN or infinite; `np.all` takes five times as long for a chunk."""
-    return bool(np.count_nonzero(np.isfinite(array)) == array.size)
+    """Whether no number is NaN or infinite."""
+    # A byte of it is 0 or 1; for the small arrays of a chunk `all` takes three times as long.
+    return 0 not in np.isfinite(array).tobytes()
 
 
 def check_actions(actions: np.ndarray, *, where: str = "actions") -> Float64[np.ndarray, "time 67"]:

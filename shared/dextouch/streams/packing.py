@@ -7,8 +7,8 @@ msgpack_numpy.py of openpi-client 0.1.2 (github.com/Physical-Intelligence/openpi
 
 import math
 import re
-from collections.abc import Callable, Mapping, Sized
-from typing import Any, Final, TypeVar
+from collections.abc import Callable, Mapping
+from typing import Any, Final
 
 import msgpack
 import numpy as np
@@ -31,7 +31,6 @@ _NAMES = {np.dtype(name).newbyteorder("<"): name for name in DTYPES}
 _KINDS: Final = "biuf"
 _NUMPY: Final = (np.ndarray, np.generic)
 _DTYPE: Final = re.compile(r"[<>|=]?(b1|[iu][1248]|f[248])")
-C = TypeVar("C", bound=Sized)
 
 
 def pack(fields: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> bytes:
@@ -89,17 +88,17 @@ def unpack_bounded(
         raise LimitExceededError(f"{what}: got {len(data)} bytes, expected at most {max_bytes}")
     num_items = 0
 
-    def counted(container: C) -> C:
+    def counted(container: Any) -> Any:  # noqa: ANN401 - a list or a map
         nonlocal num_items
         num_items += 1 + len(container)
         if num_items > MAX_ITEMS:
             raise LimitExceededError(f"{what}: lists and maps hold more than {MAX_ITEMS} items")
-        return container
+        return container if of_map is None or type(container) is list else of_map(container)
 
     try:
         return msgpack.unpackb(
             data,
-            object_hook=counted if of_map is None else lambda found: of_map(counted(found)),
+            object_hook=counted,
             list_hook=counted,
             max_array_len=MAX_ITEMS_A_CONTAINER,
             max_map_len=MAX_ITEMS_A_CONTAINER,
