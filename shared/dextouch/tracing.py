@@ -4,8 +4,8 @@ Only ids travel, in the header `traceparent`. Spans are exported where the SDK o
 installed and configured (`dextouch.serving.spans`).
 """
 
+import os
 import re
-import secrets
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -33,12 +33,12 @@ class TraceContext(NamedTuple):
 
     def child(self) -> "TraceContext":
         """A new span of the same trace."""
-        return self._replace(span_id=secrets.token_hex(8))
+        return TraceContext(self.trace_id, os.urandom(8).hex(), self.flags)
 
 
 def new_trace(trace_id: str | None = None) -> TraceContext:
     """The first span of a new trace, or a new one of the trace of this id."""
-    drawn = secrets.token_hex(24)
+    drawn = os.urandom(24).hex()
     return TraceContext(trace_id or drawn[:32], drawn[32:])
 
 

@@ -5,8 +5,8 @@ Every response has a request id and a Server-Timing header; `timed` adds parts t
 """
 
 import asyncio
+import os
 import re
-import secrets
 import time
 from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -487,7 +487,7 @@ class RequestMiddleware:
         started = time.perf_counter()
         given = header(scope, b"x-request-id") or ""
         is_usable = given and REQUEST_ID.fullmatch(given) and masked(given) == given
-        request_id = given if is_usable else secrets.token_hex(16)
+        request_id = given if is_usable else os.urandom(16).hex()
         timings_s: dict[str, float] = {}
         scope.setdefault("state", {}).update(request_id=request_id, timings_s=timings_s)
 

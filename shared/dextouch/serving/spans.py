@@ -107,7 +107,8 @@ SPANS = Spans()
 
 def traced(scope: Scope) -> AbstractContextManager[TraceContext]:
     """Continue the trace of a request's caller, or begin one; the context is the request's span."""
-    caller = parse_traceparent(header(scope, b"traceparent") or "")
+    sent = header(scope, b"traceparent")
+    caller = None if sent is None else parse_traceparent(sent)
     if SPANS.tracer is not None:
         return SPANS.of_request(scope, caller)
     return in_trace(new_trace() if caller is None else caller.child())

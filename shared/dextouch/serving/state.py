@@ -60,8 +60,9 @@ class MemoryState:
 
     async def version(self, key: str) -> int:
         """The version that `get` would return, without the value; 0 when absent or expired."""
-        stored = await self.get(key)
-        return 0 if stored is None else stored.version
+        self._expire()
+        entry = self._entries.get(key)
+        return 0 if entry is None else entry[0].version
 
     async def note(self, key: str) -> bytes:
         """The note, without the value; empty when absent or expired."""

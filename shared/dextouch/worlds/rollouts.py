@@ -95,8 +95,8 @@ class RolloutService:
         self._workers = {name: WorldWorker(world) for name, world in worlds.items()}
         self._records = RecordStore(store, ttl_s=self.limits.ttl_s)
         # The newest states of this process's rollouts, least recently used first, with their
-        # records, of which snapshot and payload are left out.
-        self._live: OrderedDict[str, tuple[RolloutRecord, Any]] = OrderedDict()
+        # records, of which snapshot and payload are left out, and locks.
+        self._live: OrderedDict[str, tuple[RolloutRecord, Any, object]] = OrderedDict()
         self._locks: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()
         # Of those, the ones that no chunk has renewed since the last sweep.
         self._unused: set[str] = set()
@@ -220,8 +220,8 @@ class RolloutService:
             EndedError: the world cannot continue; later chunks get the same error.
             LimitExceededError: the rollout has its maximum length, or the queue is full.
         """
-        lock = self._locks.setdefault(rollout_id, asyncio.Lock())
-        async with lock:
+        lock = self._locks.get(rollout_id)
+        async with lock or self._locks.setdefault(rollout_id, asyncio.Lock()):
             record = await self._newest(rollout_id, chunk)
             worker = await self._worker_of(record.info)
             description = worker.world.description
@@ -290,7 +290,7 @@ class RolloutService:
 
     async def _newest(self, rollout_id: str, chunk: int) -> RolloutRecord:
         """The record; without its large parts if the live state is to be advanced."""
-        held, _ = self._live.get(rollout_id, (None, None))
+        held, _, _ = self._live.get(rollout_id, (None, None, None))
         # Any other chunk is a repetition, which needs the stored response, or a conflict.
         is_next = held is not None and chunk == held.info.next_chunk
         if held is not None and is_next and await self._records.is_newest(held):
@@ -307,7 +307,7 @@ class RolloutService:
     ) -> Answer:
         """Compute a chunk and commit its record."""
         before = stored.info
-        held, state = self._live.get(before.id, (None, None))
+        held, state, _ = self._live.get(before.id, (None, None, None))
         if held is None or held.version != stored.version:
             state = await worker.call(worker.world.restore, stored.snapshot)
         seed = chunk_seed(before.seed, before.next_chunk, before.world_digest)
@@ -345,7 +345,7 @@ class RolloutService:
         return ended_error(info)
 
     def _keep(self, record: RolloutRecord, state: object) -> None:
-        self._live[record.info.id] = (record, state)
+        self._live[record.info.id] = (record, state, self._locks.get(record.info.id))
         self._live.move_to_end(record.info.id)
         self._unused.discard(record.info.id)
         if len(self._live) > self.limits.max_rollouts:
