@@ -107,8 +107,7 @@ SPANS = Spans()
 
 def traced(scope: Scope) -> AbstractContextManager[TraceContext]:
     """Continue the trace of a request's caller, or begin one; the context is the request's span."""
-    sent = header(scope, b"traceparent")
-    caller = None if sent is None else parse_traceparent(sent)
+    caller = parse_traceparent(sent) if (sent := header(scope, b"traceparent")) else None
     if SPANS.tracer is not None:
         return SPANS.of_request(scope, caller)
     return in_trace(new_trace() if caller is None else caller.child())

@@ -61,8 +61,7 @@ class MemoryState:
     async def version(self, key: str) -> int:
         """The version that `get` would return, without the value; 0 when absent or expired."""
         self._expire()
-        entry = self._entries.get(key)
-        return 0 if entry is None else entry[0].version
+        return self._entries[key][0].version if key in self._entries else 0
 
     async def note(self, key: str) -> bytes:
         """The note, without the value; empty when absent or expired."""

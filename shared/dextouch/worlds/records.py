@@ -307,13 +307,10 @@ async def parts_of(
     **options: Any,  # noqa: ANN401 - see answer_parts
 ) -> AnswerParts:
     """Fields and arrays of a response, from a thread where encoding the images takes long."""
-    options |= {"selector": selector}
-    num_bytes = 0
-    if selector.images == "jpeg":
-        num_bytes = sum(images.nbytes for images in seen.images.values())
-    if num_bytes <= MAX_INLINE_IMAGE_BYTES:
-        return answer_parts(rollout, seen, **options)
-    return await asyncio.to_thread(answer_parts, rollout, seen, **options)
+    sizes = (images.nbytes for images in seen.images.values())
+    if selector.images == "raw" or sum(sizes) <= MAX_INLINE_IMAGE_BYTES:
+        return answer_parts(rollout, seen, selector=selector, **options)
+    return await asyncio.to_thread(answer_parts, rollout, seen, selector=selector, **options)
 
 
 @lru_cache(maxsize=64)
