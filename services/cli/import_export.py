@@ -19,7 +19,13 @@ from dextouch.episodes import (
     RecordingReader,
     is_rejected,
 )
-from dextouch.errors import ConflictError, DexTouchError, InvalidInputError, NotFoundError
+from dextouch.errors import (
+    ConflictError,
+    CorruptDataError,
+    DexTouchError,
+    InvalidInputError,
+    NotFoundError,
+)
 from dextouch.schemas import first_problems
 from services.pipelines.parsers import (
     EXPORT_FILTERS,
@@ -29,7 +35,7 @@ from services.pipelines.parsers import (
 )
 
 if TYPE_CHECKING:
-    from dextouch.bridges.import_recording import ImportReport
+    from dextouch.bridges.import_recording import ImportAttributes, ImportReport
 
 Reader = EpisodeReader | RecordingReader
 Report = dict[str, Any]
@@ -313,12 +319,36 @@ def _import_file(
         layout=None if options.layout is None else read_layout(options.layout),
     )
     if form == "rrd":
-        from dextouch.bridges.import_rerun import import_rrd
-
-        return import_rrd(path, store, about, timeline=options.timeline)
+        return _import_rrd(path, store, about, options.timeline)
     from dextouch.bridges.import_mcap import import_any_mcap
 
     return import_any_mcap(path, store, about)
+
+
+def _import_rrd(
+    path: Path, store: EpisodeStore, about: "ImportAttributes", timeline: str | None
+) -> "ImportReport":
+    """Import in a process of its own, since Rerun's reader aborts its own at some damaged bytes."""
+    from concurrent.futures.process import BrokenProcessPool
+
+    from dextouch.jobs import worker_pool
+
+    with worker_pool(1) as pool:
+        try:
+            return pool.submit(_import_rrd_here, path, store, about, timeline).result()
+        except BrokenProcessPool as error:
+            raise CorruptDataError(
+                f"{path}: rerun-sdk ended its process while reading: the file is damaged, or "
+                "memory ran out; copy it again, or see what `rerun rrd verify` says"
+            ) from error
+
+
+def _import_rrd_here(
+    path: Path, store: EpisodeStore, about: "ImportAttributes", timeline: str | None
+) -> "ImportReport":
+    from dextouch.bridges.import_rerun import import_rrd
+
+    return import_rrd(path, store, about, timeline=timeline)
 
 
 def export_main(argv: Sequence[str]) -> int:

@@ -75,7 +75,8 @@ class Form:
 
     def _identity(self) -> tuple[object, ...]:
         shape = self.shape[1:] if self.is_padded else self.shape
-        names = tuple(sorted(self.names)) if self.kind == "robot_state" else self.names
+        by_name = self.kind == "robot_state" and len({*self.names}) == len(self.names)
+        names = tuple(sorted(self.names)) if by_name else self.names
         return self.kind, self.unit, self.dtype, shape, self.frame, names
 
     def fit(self, values: np.ndarray, other: "Form") -> np.ndarray:
@@ -363,19 +364,26 @@ def _point_cloud(types: tuple[str, ...], message: Plain) -> list[Item]:
     names, formats, offsets = [], [], []
     for field in fields:
         number, count = int(field.get("type", field.get("datatype"))), int(field.get("count", 1))
-        if not 1 <= number < len(types) or count != 1:
-            raise InvalidInputError(f"point field {field.get('name')!r} of type {number}")
+        # PCL, too, takes the count 0 that some drivers write for 1.
+        if not 1 <= number < len(types) or count not in {0, 1}:
+            what = f"{count} numbers of type {number}"
+            raise InvalidInputError(f"point field {field.get('name')!r} of {what}, expected one")
         names.append(_text(field["name"]))
         formats.append((">" if big_endian else "<") + types[number])
         offsets.append(int(field["offset"]))
-    num_points = len(data) // stride
+    height, width, row_step = 1, len(data) // stride, len(data)
     if "point_step" in message:
         width, height = int(message["width"]), int(message["height"])
-        if int(message["row_step"]) != width * stride or len(data) < width * height * stride:
-            raise InvalidInputError(f"point cloud of {height} x {width} points with padded rows")
-        num_points = width * height
-    if num_points > MAX_POINTS:
-        raise LimitExceededError(f"{num_points} points, expected at most {MAX_POINTS}")
+        # Of a single row drivers write anything here.
+        row_step = int(message["row_step"]) if height > 1 else width * stride
+    if width * height > MAX_POINTS:
+        raise LimitExceededError(f"{width * height} points, expected at most {MAX_POINTS}")
+    if (
+        min(width, height) < 0
+        or row_step < width * stride
+        or len(data) < (height - 1) * row_step + width * stride
+    ):
+        raise CorruptDataError(f"{len(data)} bytes for {height} x {width} points")
     if any(
         o < 0 or o + np.dtype(f).itemsize > stride for o, f in zip(offsets, formats, strict=True)
     ):
@@ -390,7 +398,7 @@ def _point_cloud(types: tuple[str, ...], message: Plain) -> list[Item]:
             "itemsize": stride,
         }
     )
-    points = np.frombuffer(data, dtype=record, count=num_points)
+    points = np.ndarray((height, width), record, data, strides=(row_step, stride)).ravel()
     values = np.stack([points[f].astype(dtype) for f in record.names or ()], axis=-1)
     form = Form(
         "scalar",

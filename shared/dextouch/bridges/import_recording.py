@@ -30,6 +30,15 @@ _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 # Host times before are those of a clock that counts from its start, not from 1970.
 _EARLIEST_NS: Final = int(datetime(2000, 1, 1, tzinfo=UTC).timestamp()) * _NS_PER_S
 _LATEST_NS: Final = int(datetime(2200, 1, 1, tzinfo=UTC).timestamp()) * _NS_PER_S
+# What to do with files of other kinds that come in the place of a recording.
+_OTHER_FILES: Final = {
+    b"version https://git-lfs": "it is a pointer of Git LFS, `git lfs pull` gets the file",
+    b"#ROSBAG": "it is a ROS 1 bag, convert it with `rosbags-convert --dst-storage mcap`",
+    b"SQLite": "if it is of a ROS 2 bag, convert it with `rosbags-convert --dst-storage mcap`",
+    b"\x28\xb5\x2f\xfd": "it is compressed, unpack it with `zstd -d`",
+    b"\x1f\x8b": "it is compressed, unpack it with `gunzip`",
+    b"PK": "it is a zip, unpack it",
+}
 
 
 @dataclass(frozen=True)
@@ -188,9 +197,18 @@ def find_format(path: Path) -> str:
             if start.startswith(signature):
                 return form
         found = f"a file that begins with {start.hex(' ') or 'nothing'}"
+        found += remedy(path, "") and f" ({remedy(path, '')})"
     raise InvalidInputError(
         f"{path}: got {found}, expected an MCAP file, a Rerun .rrd file, or a LeRobot data set"
     )
+
+
+def remedy(path: Path, usual: str = "copy the dataset again") -> str:
+    """What to do with a file that is not what it should be, by its first bytes."""
+    with disk_errors(f"read {path}"), path.open("rb") as file:
+        start = file.read(32)
+    found = (advice for signature, advice in _OTHER_FILES.items() if start.startswith(signature))
+    return next(found, usual)
 
 
 def stream_names(sources: Sequence[str], mapping: Mapping[str, str]) -> dict[str, str]:

@@ -112,10 +112,16 @@ def import_rrd(
     """
     if not path.is_file():
         raise NotFoundError(f"{path}: no such file; expected a Rerun .rrd file")
-    chosen = _timeline(path, timeline)
-    return import_readings(
-        path, store, about, lambda survey: _Rows(path, chosen, survey).run(), form="rrd"
-    )
+    chosen, others = _timeline(path, timeline)
+
+    def read(survey: Survey | None) -> Iterator[Reading]:
+        if survey is not None:
+            for other in others:
+                reason = f"left out; times are of {chosen!r}, when the samples were logged"
+                survey.refuse(other[:256], "timeline", reason)
+        return _Rows(path, chosen, survey).run()
+
+    return import_readings(path, store, about, read, form="rrd")
 
 
 def _chunks(path: Path) -> Iterator[Chunk]:
@@ -137,7 +143,8 @@ def _opened(path: Path) -> tuple[RrdReader, list[str]]:
             raise CorruptDataError(f"{path}: rerun-sdk cannot read it ({error})") from error
 
 
-def _timeline(path: Path, name: str | None) -> str:
+def _timeline(path: Path, name: str | None) -> tuple[str, list[str]]:
+    """The timeline, and those without times of a file that has no other with times of its own."""
     found: dict[str, bool] = {}
     for chunk in _chunks(path):
         if not chunk.is_static:
@@ -146,10 +153,12 @@ def _timeline(path: Path, name: str | None) -> str:
                 found[one] = not arrow_types.is_integer(schema.field(one).type)
     timed = [one for one, is_time in found.items() if is_time]
     own = [one for one in timed if one not in _OF_LOGGING] or timed
-    if name is None and len(own) == 1:
-        return own[0]
-    if name in timed:
-        return str(name)
+    if not found:
+        raise InvalidInputError(f"{path}: holds nothing that was logged at a time")
+    chosen = own[0] if name is None and len(own) == 1 else name
+    if chosen in timed:
+        others = sorted({*found} - {*_OF_LOGGING}) if chosen in _OF_LOGGING else []
+        return str(chosen), others
     got = "none is given" if name is None else f"{name!r} is not one of them"
     raise InvalidInputError(
         f"{path}: has the timelines {sorted(found)}, of which {sorted(timed)} are times, and "
@@ -335,8 +344,8 @@ def _moment(t_ns: int, row_id: bytes) -> int:
 
 def _plain(value: Any) -> Any:  # noqa: ANN401 - of pyarrow
     """A component without the memory of its chunk: numbers, or the dictionary of a structure."""
-    if len(value) and arrow_types.is_struct(value.values.type):
-        return value[0].as_py()
+    if arrow_types.is_struct(value.values.type):
+        return value[0].as_py() if len(value) else {}
     return _flat(value)[:16].astype(np.float64)
 
 

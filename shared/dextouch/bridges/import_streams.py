@@ -200,6 +200,8 @@ class _Part:
         if form.is_padded:
             sample_bytes = math.prod(form.shape) * np.dtype(form.dtype).itemsize
             self.num_bytes = len(self.times) * sample_bytes
+        if 0 in form.shape:
+            raise InvalidInputError(f"samples without a number, {form.describe()}")
         if not self.is_ordered and (self.video or self.num_bytes > MAX_HELD_BYTES):
             raise LimitExceededError(
                 "times go back, and there is too much to sort (or a video): sort the file by "

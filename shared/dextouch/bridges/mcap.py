@@ -466,7 +466,9 @@ def records(path: Path) -> Iterator[McapRecord]:
         try:
             yield from _records(file, path)
         except EOFError as error:
-            raise CorruptDataError(f"{path}: is truncated ({error}); copy it again") from error
+            raise CorruptDataError(
+                f"{path}: is truncated ({error}); copy it again, or see what `mcap recover` saves"
+            ) from error
         except (McapError, ValueError, KeyError, struct.error, zstandard.ZstdError) as error:
             raise CorruptDataError(
                 f"{path}: is damaged or truncated before byte {file.tell()} "

@@ -3,6 +3,7 @@
 import base64
 import struct
 import tracemalloc
+from functools import partial
 
 import numpy as np
 import pytest
@@ -15,9 +16,7 @@ from dextouch.bridges.import_messages import items_of
 from dextouch.bridges.import_recording import ImportAttributes
 from dextouch.bridges.mcap import export_mcap, records
 from dextouch.episodes import EpisodeStore
-from dextouch.errors import (
-    InvalidInputError,
-)
+from dextouch.errors import CorruptDataError, InvalidInputError
 from tests.unit.bridges.foreign_files import (
     GOLDEN,
     PIXELS,
@@ -205,6 +204,46 @@ def test_points_have_fields_of_all_types(schema, size, kind, names):
     (item,) = items_of(schema, cloud | rows)
     assert item.decode().tolist() == [values] * 2
     assert item.form.names == tuple(numbers)
+
+
+def test_points_in_rows_that_end_in_padding_and_with_fields_of_count_zero():
+    """PCL writes no padding, but reads it; drivers write the count 0 and any step of one row."""
+    points = np.arange(24, dtype=">f4").reshape(2, 4, 3)
+    padded = np.concatenate([points.view("u1").reshape(2, -1), np.full((2, 5), 9, "u1")], axis=1)
+    fields = [{"name": n, "offset": 4 * k, "datatype": 7, "count": 0} for k, n in enumerate("xyz")]
+    cloud = {"fields": fields, "point_step": 12, "is_bigendian": True}
+    rows = {"width": 4, "height": 2, "row_step": 53, "data": padded.tobytes()[:-5]}
+    read = partial(items_of, "sensor_msgs/PointCloud2")
+    assert read(cloud | rows)[0].decode().tolist() == points.reshape(8, 3).tolist()
+    one = {"width": 8, "height": 1, "row_step": 0, "data": points.tobytes()}
+    assert read(cloud | one)[0].decode().tolist() == points.reshape(8, 3).tolist()
+    for wrong in ({"row_step": 47}, {"height": 3}, {"width": -4, "height": -2}, {"width": 5}):
+        with pytest.raises(CorruptDataError, match="bytes for"):
+            read(cloud | rows | wrong)
+    fields[0]["count"] = 3
+    with pytest.raises(InvalidInputError, match="'x' of 3 numbers of type 7"):
+        read(cloud | rows)
+
+
+def test_joints_of_one_name_are_not_mistaken_for_each_other(store, tmp_path):
+    def joints(*pairs):
+        return {"joints": [{"name": name, "position": value} for name, value in pairs]}
+
+    messages = [
+        ("/j", "foxglove.JointStates", joints(("a", 1), ("b", 2), ("a", 3))),
+        ("/j", "foxglove.JointStates", joints(("a", 4), ("b", 5), ("a", 6))),
+        ("/j", "foxglove.JointStates", joints(("a", 1), ("a", 2), ("b", 3))),
+        (
+            "/none",
+            "foxglove.PointCloud",
+            {"data": "", "point_stride": 4, "fields": [{"name": "x", "offset": 0, "type": 7}]},
+        ),
+    ]
+    report = import_any_mcap(json_file(tmp_path / "j.mcap", messages), store, ImportAttributes())
+    assert store.recording("j").values("j", 0, 2).tolist() == [[1, 2, 3], [4, 5, 6]]
+    reasons = {one.source: one.reason for one in report.refused}
+    assert "of other names" in reasons["/j"]
+    assert reasons["/none"] == "samples without a number, numbers [0, 1]"
 
 
 def stripped(reader, store, folder, name):

@@ -102,6 +102,10 @@ def test_the_timeline_is_chosen(store, tmp_path):
     path = rrd(tmp_path / "none.rrd", ())
     report = import_rrd(path, store, ImportAttributes())
     assert abs(report.imported[0].duration_s) < 60
+    assert ("frame", "timeline") in [(one.source, one.schema) for one in report.refused]
+    rr.RecordingStream("lab").save(tmp_path / "empty.rrd")
+    with pytest.raises(InvalidInputError, match="nothing that was logged at a time"):
+        import_rrd(tmp_path / "empty.rrd", store, ImportAttributes())
 
 
 def test_an_export_of_ours_comes_back_as_numbers(store, tmp_path):
@@ -159,6 +163,21 @@ def test_components_that_rows_leave_out_are_the_newest_in_time(store, tmp_path):
     assert recording.values("x", 0, 5)[:, 0].tolist() == [0, 1, 2, 3, 4]
     assert recording.values("image", 0, 3)[:, 2, 1].tolist() == [0, 1, 2]
     assert [(one.source, one.num_samples) for one in report.refused] == [("/image", 2)]
+
+
+def test_parts_that_a_row_clears_have_their_defaults(store, tmp_path):
+    """As every call of Transform3D does up to Rerun 0.23."""
+    stream = saved(tmp_path / "a.rrd")
+    at(stream, 0)
+    turned = rr.Quaternion(xyzw=[0, 0, 0.6, 0.8])
+    stream.log("hand", rr.Transform3D.from_fields(clear_unset=True, quaternion=turned))
+    at(stream, 1)
+    stream.log("hand", rr.Transform3D.from_fields(clear_unset=True, translation=[1, 2, 3]))
+    stream.disconnect()
+    report = import_rrd(tmp_path / "a.rrd", store, ImportAttributes())
+    poses = store.recording("a").values("hand", 0, 2)
+    np.testing.assert_allclose(poses, [[0, 0, 0, 0.8, 0, 0, 0.6], [1, 2, 3, 1, 0, 0, 0]], atol=1e-6)
+    assert not report.refused
 
 
 def test_what_is_left_out_is_said(store, tmp_path):

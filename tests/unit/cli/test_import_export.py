@@ -427,3 +427,29 @@ def test_help_teaches_with_examples(word, capsys):
     text = capsys.readouterr().out
     assert f"dextouch {word} --format mcap" in text
     assert "lerobot" in text
+
+
+def test_a_rerun_file_that_ends_its_reader_is_an_error(dextouch, tmp_path):
+    rr = pytest.importorskip("rerun")
+    for name in ("a", "b"):
+        stream = rr.RecordingStream("lab")
+        stream.save(tmp_path / f"{name}.rrd")
+        for k in range(3):
+            stream.set_time("camera", timestamp=np.datetime64(1_700_000_000 + k, "s"))
+            stream.log("glove", rr.AnyValues(pressure=[1.0 * k]))
+        stream.disconnect()
+    # Rust panics at a zero byte in a name where it cannot unwind.
+    path = tmp_path / "a.rrd"
+    path.write_bytes(path.read_bytes().replace(b"pressure", b"pre\0sure", 1))
+    status, _, err = dextouch("import", path)
+    assert status == main.EXIT_REFUSED
+    assert "a.rrd: rerun-sdk ended its process" in err
+    folder = tmp_path / "both"
+    folder.mkdir()
+    for name in ("a", "b"):
+        (tmp_path / f"{name}.rrd").rename(folder / f"{name}.rrd")
+    status, out, err = dextouch("import", folder)
+    assert status == 3
+    assert "glove" in out
+    assert "a.rrd: not imported" in err
+    assert EpisodeStore(tmp_path / "store").recording("b").values("glove", 2, 3).tolist() == [[2]]

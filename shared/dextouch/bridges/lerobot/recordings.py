@@ -388,7 +388,10 @@ def frame_times(
         ]
     said_s = source.numbers(entry, "timestamp").astype(np.float64)
     if not np.isfinite(said_s).all() or np.abs(said_s).max() > 1e9:
-        raise CorruptDataError(f"{where}: timestamp is not a time in seconds")
+        raise CorruptDataError(
+            f"{where}: timestamp has numbers up to {np.abs(said_s).max():g}, expected seconds from "
+            "the start of the episode; --fps RATE takes the frames' numbers instead"
+        )
     if (np.diff(said_s) <= 0).any():
         raise CorruptDataError(
             f"{where}: timestamp does not rise from frame to frame; --fps RATE takes the frames' "
@@ -412,6 +415,8 @@ def dataset_contradictions(source: LeRobotFolder) -> list[str]:
     """What `meta/` says of a dataset and its files do not hold, or say otherwise."""
     info, problems = source.info, []
     num_frames = sum(entry.length for entry in source.episodes)
+    if source.episodes and (last := source.episodes[-1].index) >= len(source.episodes):
+        problems.append(f"of the episodes 0 … {last} there are {len(source.episodes)}")
     if info.total_frames not in {None, num_frames}:
         problems.append(
             f"info.json says {info.total_frames} frames, the episodes have {num_frames}"
@@ -435,7 +440,7 @@ def dataset_contradictions(source: LeRobotFolder) -> list[str]:
 
 def _episode_contradictions(source: LeRobotFolder, entry: EpisodeEntry) -> Iterator[str]:
     rows = source.rows(entry)
-    if TASK_INDEX in rows.column_names and source.tasks:
+    if TASK_INDEX in source.info.features and source.tasks:
         numbers = np.unique(source.numbers(entry, TASK_INDEX)).tolist()
         texts = {source.tasks.get(number, f"task {number}") for number in numbers}
         if texts != {*entry.tasks}:
