@@ -461,3 +461,16 @@ def test_video_with_b_frames_is_refused(codec, store, tmp_path):
         recorder.add("/video", "CompressedVideo", T0 + k * STEP, data=data, format=form)
     with pytest.raises(InvalidInputError, match="B-frames"):
         import_any_mcap(recorder.done(), store, ImportAttributes())
+
+
+def test_images_of_another_size_later_in_a_video_are_refused(store, tmp_path):
+    """As a camera sends them whose resolution is changed while it records."""
+    recorder = Recorder(tmp_path / "video.mcap")
+    units = [*video(16, keyint=8), *video(8, keyint=8, size_px=(64, 96))]
+    for k, data in enumerate(units):
+        recorder.add("/video", "CompressedVideo", T0 + k * STEP, data=data, format="h264")
+    report = import_any_mcap(recorder.done(), store, ImportAttributes())
+    level = store.recording("video").values("video", 0, 16).mean((1, 2, 3))
+    np.testing.assert_allclose(level, [20 * (k % 10) for k in range(16)], atol=6)
+    (refused,) = report.refused
+    assert (refused.num_samples, refused.reason[:21]) == (8, "image of another size")
