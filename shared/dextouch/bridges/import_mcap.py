@@ -158,7 +158,9 @@ class _Readings:
                     return
                 # Of an export of ours without its attachments; 0 in those of episodes.
                 number = int(plain.get(SEQUENCE) or reading.sequence)
-                reading = replace(reading, items=tuple(items_of(schema, plain)), sequence=number)
+                is_typed = channel.message_encoding != "json"
+                items = tuple(items_of(schema, plain, is_typed=is_typed))
+                reading = replace(reading, items=items, sequence=number)
             except DexTouchError as error:
                 reason = error.message
         yield replace(reading, reason=reason) if reason else reading

@@ -128,8 +128,10 @@ def schema_name(name: str) -> str:
     return name.replace("/msg/", "/").replace("foxglove_msgs/", "foxglove.")
 
 
-def items_of(schema: str, message: Plain) -> list[Item]:
+def items_of(schema: str, message: Plain, *, is_typed: bool = True) -> list[Item]:
     """Samples of a message of a schema, by its `schema_name`.
+
+    Without `is_typed`, as of JSON, a number may be whole by chance.
 
     Raises:
         InvalidInputError: a message that this release cannot read, with the reason.
@@ -145,7 +147,8 @@ def items_of(schema: str, message: Plain) -> list[Item]:
         if schema.startswith("dextouch.") and "shape" in message:
             return [_our_array(schema, message)]
         ours = {T_DEVICE, SEQUENCE} & message.keys()
-        item = _flat({name: value for name, value in message.items() if name not in ours})
+        left = {name: value for name, value in message.items() if name not in ours}
+        item = _flat(left, is_typed=is_typed)
         return [replace(item, t_device_ns=_stamp_ns(message)) if ours else item]
     except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:
         raise CorruptDataError(
@@ -489,7 +492,7 @@ def _array(message: Plain, values: np.ndarray, shape: tuple[int, ...], dtype: st
     return _array_item(message, form, values)
 
 
-def _flat(message: Plain) -> Item:
+def _flat(message: Plain, *, is_typed: bool) -> Item:
     """All numbers of a message, in its order, with their paths as names."""
     paths: list[tuple[str, int]] = []
     numbers: list[np.ndarray] = []
@@ -502,10 +505,10 @@ def _flat(message: Plain) -> Item:
             continue
         if isinstance(value, np.ndarray):
             paths.append((path, value.size if value.ndim else -1))
-            numbers.append(value.ravel().astype(np.float64))
+            numbers.append(value.ravel())
             size += value.size
-            is_whole = value.dtype.kind in "iu" and value.size
-            if is_whole and max(-int(value.min()), int(value.max())) > _MAX_EXACT:
+            has_whole = value.dtype.kind in "iu" and value.size
+            if has_whole and max(-int(value.min()), int(value.max())) > _MAX_EXACT:
                 rounded.append(path)
         elif value not in {None, ""} and path not in {"frame_id", "header.frame_id"}:
             skipped.append(path)
@@ -513,18 +516,21 @@ def _flat(message: Plain) -> Item:
             raise LimitExceededError(f"message of more than {MAX_NUMBERS} values")
     if not size:
         raise InvalidInputError("message without a number")
-    said = {"left out, not numbers": skipped, "above 2^53, rounded": rounded}
+    values = np.concatenate([one for one in numbers if one.size])
+    is_whole = is_typed and np.can_cast(values.dtype, np.int64)
+    said = {"left out, not numbers": skipped}
+    said |= {} if is_whole else {"above 2^53, rounded": rounded}
     form = Form(
         "scalar",
         NUMBERS_UNIT,
-        "float64",
+        "int64" if is_whole else "float64",
         (size,),
         _frame(message),
         _names(tuple(paths)),
         as_numbers="no schema that this release knows",
         notes=tuple(f"{what}: {', '.join(which[:8])}" for what, which in said.items() if which),
     )
-    return _array_item(message, form, np.concatenate(numbers))
+    return _array_item(message, form, values)
 
 
 @lru_cache(maxsize=64)

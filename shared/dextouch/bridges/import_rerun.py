@@ -478,12 +478,16 @@ def _numbers(row: Row, known: Known, frame: str | None) -> Iterator[Item]:
             arrow_types.is_floating(value.values.type) or arrow_types.is_integer(value.values.type)
         ):
             raise InvalidInputError(f"component {name}, which this release does not read")
-        numbers = _flat(value).astype("<f8")
+        numbers = _flat(value)
+        if numbers.dtype == np.uint64 and numbers.max() > np.iinfo(np.int64).max:
+            raise InvalidInputError(f"component {name}: numbers above 2^63, which no stream can")
+        numbers = numbers.astype("<i8" if numbers.dtype.kind in "iu" else "<f8")
         if len(numbers) > MAX_POINTS:
             raise InvalidInputError(f"{len(numbers)} numbers, expected at most {MAX_POINTS}")
         is_scalars = _archetype(name) == "Scalars"
         said = "" if is_scalars else f"component {name}"
-        form = Form("scalar", NUMBERS_UNIT, "float64", numbers.shape, frame, as_numbers=said)
+        dtype = numbers.dtype.name
+        form = Form("scalar", NUMBERS_UNIT, dtype, numbers.shape, frame, as_numbers=said)
         yield _item(form, numbers.copy, "Scalars" if is_scalars else name)
 
 

@@ -307,6 +307,34 @@ def test_numbers_are_neither_dropped_nor_rounded_unsaid(store, tmp_path):
     assert "more than 1048576 values" in reasons["/empty"]
 
 
+def test_whole_numbers_of_a_message_stay_whole(store, tmp_path):
+    """As counts of raw cells, which as floats would be taxels in kPa."""
+    pytest.importorskip("mcap_ros2")
+    recorder = Recorder(tmp_path / "cells.mcap")
+    fields = (b"uint16[360] cells", b"int64 n\nuint64 u", b"int64 n\nfloat64[] x", b"uint64 u")
+    for k, field in enumerate(fields):
+        recorder.channel(f"/m{k}", f"lab/msg/M{k}", "ros2msg", field, "cdr")
+    cells = np.arange(360, dtype="<u2")
+    for k, body in enumerate(
+        (
+            cells.tobytes(),
+            struct.pack("<qQ", 2**60 + 1, 5),
+            struct.pack("<qIxxxxd", 3, 1, 0.5),
+            struct.pack("<Q", 2**64 - 2),
+        )
+    ):
+        recorder.raw(f"/m{k}", b"\0\1\0\0" + body, T0)
+    about = ImportAttributes(mapping={"tactile_left": "/m0"})
+    report = import_any_mcap(recorder.done(), store, about)
+    recording = store.recording("cells")
+    stream = recording.streams["tactile_left"]
+    assert (stream.unit, stream.kind, stream.shape) == ("counts", "tactile", (360,))
+    assert recording.values("tactile_left", 0, 1)[0].tolist() == cells.tolist()
+    assert recording.values("m1", 0, 1).tolist() == [[2**60 + 1, 5]]
+    assert recording.values("m2", 0, 1).tolist() == [[3, 0.5]]
+    assert [one.notes for one in report.imported if one.notes] == [("above 2^53, rounded: u",)]
+
+
 def test_rectified_images_have_the_matrix_of_their_projection(store, tmp_path):
     size = {"width": 64, "height": 48, "frame_id": "cam"}
     K, P = [60, 0, 31.5, 0, 60, 23.5, 0, 0, 1], [50, 0, 30.5, 0, 0, 50, 22.5, 0, 0, 0, 1, 0]

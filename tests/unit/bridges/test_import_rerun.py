@@ -165,19 +165,22 @@ def test_components_that_rows_leave_out_are_the_newest_in_time(store, tmp_path):
     assert [(one.source, one.num_samples) for one in report.refused] == [("/image", 2)]
 
 
-def test_parts_that_a_row_clears_have_their_defaults(store, tmp_path):
-    """As every call of Transform3D does up to Rerun 0.23."""
+def test_parts_that_a_row_clears_have_their_defaults_and_whole_numbers_are_exact(store, tmp_path):
+    """Every call of Transform3D up to Rerun 0.23 clears the parts that it leaves out."""
     stream = saved(tmp_path / "a.rrd")
     at(stream, 0)
     turned = rr.Quaternion(xyzw=[0, 0, 0.6, 0.8])
     stream.log("hand", rr.Transform3D.from_fields(clear_unset=True, quaternion=turned))
     at(stream, 1)
     stream.log("hand", rr.Transform3D.from_fields(clear_unset=True, translation=[1, 2, 3]))
+    stream.log("stamp", rr.AnyValues(ns=T0 + 1))
+    stream.log("big", rr.AnyValues(big=np.array([2**63], dtype=np.uint64)))
     stream.disconnect()
     report = import_rrd(tmp_path / "a.rrd", store, ImportAttributes())
+    assert store.recording("a").values("stamp", 0, 1).tolist() == [[T0 + 1]]
     poses = store.recording("a").values("hand", 0, 2)
     np.testing.assert_allclose(poses, [[0, 0, 0, 0.8, 0, 0, 0.6], [1, 2, 3, 1, 0, 0, 0]], atol=1e-6)
-    assert not report.refused
+    assert [one.source for one in report.refused] == ["/big"]
 
 
 def test_what_is_left_out_is_said(store, tmp_path):
