@@ -35,7 +35,7 @@ from services.pipelines.parsers import (
 )
 
 if TYPE_CHECKING:
-    from dextouch.bridges.import_recording import ImportAttributes, ImportReport
+    from dextouch.bridges.import_recording import ImportReport
 
 Reader = EpisodeReader | RecordingReader
 Report = dict[str, Any]
@@ -227,10 +227,10 @@ def _paths(ids: Sequence[str], options: argparse.Namespace) -> dict[str, Path]:
 
 
 def _end_mcap(exported: Sequence[Attributes], options: argparse.Namespace) -> Report:
+    from dextouch.bridges.export_files import wall_offset_ns
     from dextouch.bridges.foxglove import write_layout
-    from dextouch.bridges.mcap import has_wall_times
 
-    num_undated = sum(not has_wall_times(about) for about in exported)
+    num_undated = sum(wall_offset_ns(about) is None for about in exported)
     if num_undated:
         print(
             f"{num_undated} of {len(exported)} do not know when they were recorded (created_at, or "
@@ -286,10 +286,11 @@ def _import(options: argparse.Namespace) -> Report:
     files = [file for file in found if file == path or not is_system_file(file.name)]
     if not files:
         raise NotFoundError(f"{path}: holds no .{form} file")
+    import_file = _import_apart if form == "rrd" else _import_file
     reports, failed = [], {}
     for file in progress(files, f"import {form}", len(files)):
         try:
-            report = _import_file(file, store, form, options)
+            report = import_file(file, store, form, options)
         except DexTouchError as error:
             if len(files) == 1:
                 raise
@@ -319,36 +320,30 @@ def _import_file(
         layout=None if options.layout is None else read_layout(options.layout),
     )
     if form == "rrd":
-        return _import_rrd(path, store, about, options.timeline)
+        from dextouch.bridges.import_rerun import import_rrd
+
+        return import_rrd(path, store, about, timeline=options.timeline)
     from dextouch.bridges.import_mcap import import_any_mcap
 
     return import_any_mcap(path, store, about)
 
 
-def _import_rrd(
-    path: Path, store: EpisodeStore, about: "ImportAttributes", timeline: str | None
+def _import_apart(
+    path: Path, store: EpisodeStore, form: str, options: argparse.Namespace
 ) -> "ImportReport":
-    """Import in a process of its own, since Rerun's reader aborts its own at some damaged bytes."""
+    """`_import_file` in a process of its own, since Rerun's reader aborts it at some damage."""
     from concurrent.futures.process import BrokenProcessPool
 
     from dextouch.jobs import worker_pool
 
     with worker_pool(1) as pool:
         try:
-            return pool.submit(_import_rrd_here, path, store, about, timeline).result()
+            return pool.submit(_import_file, path, store, form, options).result()
         except BrokenProcessPool as error:
             raise CorruptDataError(
                 f"{path}: rerun-sdk ended its process while reading: the file is damaged, or "
                 "memory ran out; copy it again, or see what `rerun rrd verify` says"
             ) from error
-
-
-def _import_rrd_here(
-    path: Path, store: EpisodeStore, about: "ImportAttributes", timeline: str | None
-) -> "ImportReport":
-    from dextouch.bridges.import_rerun import import_rrd
-
-    return import_rrd(path, store, about, timeline=timeline)
 
 
 def export_main(argv: Sequence[str]) -> int:

@@ -43,16 +43,7 @@ MAX_JSON_VALUES: Final = 1 << 20
 _MAX_NS: Final = (1 << 63) - 1
 _OF_EXPORTS: Final = (ABOUT, ATTRIBUTES_FILE)
 # What parsers of schemas raise for those that are not valid.
-_SCHEMA_ERRORS: Final = (
-    AttributeError,
-    KeyError,
-    IndexError,
-    NameError,
-    NotImplementedError,
-    RecursionError,
-    TypeError,
-    ValueError,
-)
+_SCHEMA_ERRORS = (AttributeError, LookupError, NameError, RuntimeError, TypeError, ValueError)
 Decoder = Callable[[bytes], Plain]
 
 

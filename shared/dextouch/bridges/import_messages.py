@@ -356,10 +356,8 @@ def _poses_message(message: Plain) -> list[Item]:
 
 def _point_cloud(types: tuple[str, ...], message: Plain) -> list[Item]:
     """Points with all their fields, padded with NaN to those of the largest cloud."""
-    data, stride = (
-        _bytes(message["data"]),
-        int(message.get("point_stride", message.get("point_step", 0))),
-    )
+    data = _bytes(message["data"])
+    stride = int(message.get("point_stride", message.get("point_step", 0)))
     fields = message["fields"]
     if not 1 <= len(fields) <= MAX_POINT_FIELDS or stride < 1:
         raise CorruptDataError(f"point cloud with {len(fields)} fields in {stride} bytes")
@@ -393,26 +391,14 @@ def _point_cloud(types: tuple[str, ...], message: Plain) -> list[Item]:
         raise CorruptDataError("point cloud with a field beyond its points")
     wide = any(one[1:] in {"f8", "i4", "u4"} for one in formats)
     dtype = "float64" if wide else "float32"
-    record = np.dtype(
-        {
-            "names": [f"f{k}" for k in range(len(names))],
-            "formats": formats,
-            "offsets": offsets,
-            "itemsize": stride,
-        }
-    )
+    keys = [f"f{k}" for k in range(len(names))]
+    record = np.dtype({"names": keys, "formats": formats, "offsets": offsets, "itemsize": stride})
     points = np.ndarray((height, width), record, data, strides=(row_step, stride)).ravel()
-    values = np.stack([points[f].astype(dtype) for f in record.names or ()], axis=-1)
+    values = np.stack([points[key].astype(dtype) for key in keys], axis=-1)
     form = Form(
-        "scalar",
-        NUMBERS_UNIT,
-        dtype,
-        values.shape,
-        _frame(message),
-        tuple(names),
-        is_padded=True,
-        as_numbers="points",
-    )
+        "scalar", NUMBERS_UNIT, dtype, values.shape, _frame(message), tuple(names),
+        is_padded=True, as_numbers="points",
+    )  # fmt: skip
     if (pose := message.get("pose")) is not None and (moved := _moved(pose)) != _moved({}):
         form = replace(form, notes=(f"pose of the points in their frame left out: {moved}",))
     return [_array_item(message, form, values)]
@@ -518,18 +504,13 @@ def _flat(message: Plain, *, is_typed: bool) -> Item:
         raise InvalidInputError("message without a number")
     values = np.concatenate([one for one in numbers if one.size])
     is_whole = is_typed and np.can_cast(values.dtype, np.int64)
-    said = {"left out, not numbers": skipped}
-    said |= {} if is_whole else {"above 2^53, rounded": rounded}
+    dtype = "int64" if is_whole else "float64"
+    said = {"left out, not numbers": skipped, "above 2^53, rounded": [] if is_whole else rounded}
     form = Form(
-        "scalar",
-        NUMBERS_UNIT,
-        "int64" if is_whole else "float64",
-        (size,),
-        _frame(message),
-        _names(tuple(paths)),
+        "scalar", NUMBERS_UNIT, dtype, (size,), _frame(message), _names(tuple(paths)),
         as_numbers="no schema that this release knows",
         notes=tuple(f"{what}: {', '.join(which[:8])}" for what, which in said.items() if which),
-    )
+    )  # fmt: skip
     return _array_item(message, form, values)
 
 

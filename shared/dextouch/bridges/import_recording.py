@@ -36,8 +36,6 @@ _OTHER_FILES: Final = {
     b"#ROSBAG": "it is a ROS 1 bag, convert it with `rosbags-convert --dst-storage mcap`",
     b"SQLite": "if it is of a ROS 2 bag, convert it with `rosbags-convert --dst-storage mcap`",
     b"\x28\xb5\x2f\xfd": "it is compressed, unpack it with `zstd -d`",
-    b"\x1f\x8b": "it is compressed, unpack it with `gunzip`",
-    b"PK": "it is a zip, unpack it",
 }
 
 
@@ -181,6 +179,7 @@ def find_format(path: Path) -> str:
 
     Raises InvalidInputError if it is none of these.
     """
+    expected = "expected an MCAP file, a Rerun .rrd file, or a LeRobot data set"
     if path.is_dir():
         if (path / "meta" / "info.json").is_file():
             return "lerobot"
@@ -197,10 +196,8 @@ def find_format(path: Path) -> str:
             if start.startswith(signature):
                 return form
         found = f"a file that begins with {start.hex(' ') or 'nothing'}"
-        found += remedy(path, "") and f" ({remedy(path, '')})"
-    raise InvalidInputError(
-        f"{path}: got {found}, expected an MCAP file, a Rerun .rrd file, or a LeRobot data set"
-    )
+        expected = remedy(path, expected)
+    raise InvalidInputError(f"{path}: got {found}; {expected}")
 
 
 def remedy(path: Path, usual: str = "copy the dataset again") -> str:

@@ -26,7 +26,7 @@ from dextouch.bridges.import_messages import (
     encoded_image,
     raw_image,
 )
-from dextouch.bridges.import_recording import ImportAttributes, ImportReport
+from dextouch.bridges.import_recording import ImportAttributes, ImportReport, Refused
 from dextouch.bridges.import_streams import Reading, Survey, import_readings
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import (
@@ -113,15 +113,12 @@ def import_rrd(
     if not path.is_file():
         raise NotFoundError(f"{path}: no such file; expected a Rerun .rrd file")
     chosen, others = _timeline(path, timeline)
-
-    def read(survey: Survey | None) -> Iterator[Reading]:
-        if survey is not None:
-            for other in others:
-                reason = f"left out; times are of {chosen!r}, when the samples were logged"
-                survey.refuse(other[:256], "timeline", reason)
-        return _Rows(path, chosen, survey).run()
-
-    return import_readings(path, store, about, read, form="rrd")
+    report = import_readings(
+        path, store, about, lambda survey: _Rows(path, chosen, survey).run(), form="rrd"
+    )
+    reason = f"left out; times are of {chosen!r}, when the samples were logged"
+    report.refused += [Refused(other[:256], reason, "timeline") for other in others]
+    return report
 
 
 def _chunks(path: Path) -> Iterator[Chunk]:

@@ -110,11 +110,6 @@ def export_mcap(
         return _Export(reader, writer, jpeg_quality).run(touch_images=touch_images)
 
 
-def has_wall_times(about: Attributes) -> bool:
-    """Whether it is known when an item began, so that an export has Unix times."""
-    return wall_offset_ns(about) is not None
-
-
 # Log time, order of the channel among equal ones, publish time, counter and bytes of a message.
 _Timed = tuple[int, int, int, int, bytes]
 

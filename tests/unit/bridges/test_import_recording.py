@@ -111,7 +111,7 @@ def test_an_import_is_whole_or_not_at_all(tmp_path: Path) -> None:
         (b"SQLite format 3\0", "rosbags-convert"),
         (b"version https://git-lfs.github.com/spec/v1", "git lfs pull"),
         (bytes.fromhex("28b52ffd"), "zstd -d"),
-        (b"\x89HDF", r"89 48 44 46, expected"),
+        (b"\x89HDF", r"89 48 44 46; expected"),
     ],
 )
 def test_files_of_other_kinds_say_what_to_do(tmp_path, start, advice) -> None:

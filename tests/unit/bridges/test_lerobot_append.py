@@ -131,7 +131,7 @@ def _other_splits(folder, _):
 
 def _holes(folder, _):
     edit_column(folder, EPISODES, "episode_index", set_item(0, 2))
-    return APPEND, "holes"
+    return APPEND, "total_episodes 1, expected 3"
 
 
 def _touch(folder, _):

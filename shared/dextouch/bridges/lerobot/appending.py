@@ -49,6 +49,8 @@ class ExistingDataset:
             "data_path": layout.DATA_PATH,
             "chunks_size": layout.CHUNK_FILES,
             "splits": {"train": f"0:{len(source.episodes)}"},
+            # Without holes in the numbering.
+            "total_episodes": max((one.index for one in source.episodes), default=-1) + 1,
         }
         for key, value in expected.items():
             if info.get(key) != value:
@@ -56,11 +58,6 @@ class ExistingDataset:
                     f"{folder}: cannot be appended to: info.json has {key} {info.get(key)!r}, "
                     f"expected {value!r}; export into a new folder"
                 )
-        if any(entry.index != k for k, entry in enumerate(source.episodes)):
-            raise InvalidInputError(
-                f"{folder}: cannot be appended to: the numbers of its episodes have holes; export "
-                "into a new folder"
-            )
         sidecars = [source.sidecar(entry) for entry in source.episodes]
         known = frozenset(one.content_sha256 for one in sidecars if one is not None)
         return ExistingDataset(source, info, _read_statistics(folder, info["features"]), known)

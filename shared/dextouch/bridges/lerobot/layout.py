@@ -179,10 +179,9 @@ def numbered_path(folder: Path, template: str, number: int, **values: str) -> Pa
 
 
 def confined(folder: Path, relative: str) -> Path:
-    """A path below `folder`; raises CorruptDataError if it leads out, by links or otherwise.
+    """A path below `folder`, following links; raises CorruptDataError if it leads out.
 
-    A snapshot in the cache of the Hub has links to the blobs of its repository, which are part of
-    it.
+    Links of a snapshot in the cache of the Hub may lead to the blobs of its repository.
     """
     root = folder.resolve()
     if "\0" in relative:
