@@ -148,7 +148,9 @@ class _Readings:
                         self._survey.note_camera(channel.topic, camera_model(plain))
                     return
                 # Of an export of ours without its attachments; 0 in those of episodes.
-                number = int(plain.get(SEQUENCE) or reading.sequence)
+                number = plain.get(SEQUENCE)
+                if not (isinstance(number, int) and 0 < number <= _MAX_NS):
+                    number = reading.sequence
                 is_typed = channel.message_encoding != "json"
                 items = tuple(items_of(schema, plain, is_typed=is_typed))
                 reading = replace(reading, items=items, sequence=number)

@@ -240,13 +240,16 @@ def _stamp_ns(message: Plain) -> int:
     """The message's own time; NO_DEVICE_TIME without one, and for 0, which means the same."""
     path = _stamp_path(message)
     if T_DEVICE in message:
-        return max(0, int(message[T_DEVICE])) or NO_DEVICE_TIME
-    if not path:
+        t_ns = int(message[T_DEVICE])
+    elif path:
+        stamp = message["header"]["stamp"] if path == "header.stamp." else message["timestamp"]
+        seconds = stamp.get("sec", stamp.get("seconds", 0))
+        nanos = stamp.get("nsec", stamp.get("nanosec", stamp.get("nanos", 0)))
+        # Some write the whole time as seconds.
+        whole_s = int(seconds)
+        t_ns = whole_s * _NS_PER_S + int(nanos) + round((float(seconds) - whole_s) * _NS_PER_S)
+    else:
         return NO_DEVICE_TIME
-    stamp = message["header"]["stamp"] if path == "header.stamp." else message["timestamp"]
-    seconds = stamp.get("sec", stamp.get("seconds", 0))
-    nanos = stamp.get("nsec", stamp.get("nanosec", stamp.get("nanos", 0)))
-    t_ns = int(seconds) * _NS_PER_S + int(nanos)
     return t_ns if 0 < t_ns <= _MAX_NS else NO_DEVICE_TIME
 
 

@@ -291,6 +291,8 @@ def test_numbers_are_neither_dropped_nor_rounded_unsaid(store, tmp_path):
         ("/b", "", {"big": 0, "list": [1, 2]}),
         ("/b", "", {"big": 2**60 + 1, "list": [1, 2**53 + 1]}),
         ("/c", "", stamped),
+        ("/d", "", {"dextouch_sequence": "a", "dextouch_t_device_ns": 10**30, "v": 1}),
+        ("/d", "", {"dextouch_sequence": 10**30, "timestamp": {"sec": 1.75}, "v": 2}),
         ("/deep", "", b'{"a":' * 900 + b"1" + b"}" * 900),
         ("/lists", "", b'{"a":' + b"[" * 900 + b"1" + b"]" * 900 + b"}"),
         ("/empty", "", b'{"a":[' + b"{}," * (1 << 20) + b"{}]}"),
@@ -299,6 +301,8 @@ def test_numbers_are_neither_dropped_nor_rounded_unsaid(store, tmp_path):
     streams = store.recording("a").streams
     assert (streams["a"].names, streams["c"].names) == (("timestamp", "v"), ("header.seq", "v"))
     assert store.recording("a").stamps("c").t_device_ns.tolist() == [10**9 + 2]
+    odd = store.recording("a").stamps("d")
+    assert (odd.sequence.tolist(), odd.t_device_ns.tolist()) == ([-1, -1], [-1, 1_750_000_000])
     notes = {one.source: one.notes for one in report.imported}
     assert notes["/b"] == ("above 2^53, rounded: big, list",)
     reasons = {one.source: one.reason for one in report.refused}
