@@ -151,8 +151,7 @@ class _Readings:
                 number = plain.get(SEQUENCE)
                 if not (isinstance(number, int) and 0 < number <= _MAX_NS):
                     number = reading.sequence
-                is_typed = channel.message_encoding != "json"
-                items = tuple(items_of(schema, plain, is_typed=is_typed))
+                items = tuple(items_of(schema, plain, is_typed=channel.message_encoding != "json"))
                 reading = replace(reading, items=items, sequence=number)
             except DexTouchError as error:
                 reason = error.message

@@ -115,7 +115,7 @@ class CameraModel:
     more.
     """
 
-    frame: str
+    frame: str | None
     size_px: tuple[int, int]
     K: tuple[float, ...]
     distortion: tuple[float, ...]
@@ -380,13 +380,10 @@ def _point_cloud(types: tuple[str, ...], message: Plain) -> list[Item]:
         width, height = int(message["width"]), int(message["height"])
         # Of a single row drivers write anything here.
         row_step = int(message["row_step"]) if height > 1 else width * stride
+    row = width * stride
     if width * height > MAX_POINTS:
         raise LimitExceededError(f"{width * height} points, expected at most {MAX_POINTS}")
-    if (
-        min(width, height) < 0
-        or row_step < width * stride
-        or len(data) < (height - 1) * row_step + width * stride
-    ):
+    if min(width, height) < 0 or row_step < row or len(data) < (height - 1) * row_step + row:
         raise CorruptDataError(f"{len(data)} bytes for {height} x {width} points")
     if any(
         o < 0 or o + np.dtype(f).itemsize > stride for o, f in zip(offsets, formats, strict=True)

@@ -496,7 +496,7 @@ def _pinhole(known: Known) -> CameraModel | None:
     width_px, height_px = (int(one) for one in size)
     check_pixels(height_px, width_px)
     K = K.reshape(3, 3).T.ravel()
-    return CameraModel("", (height_px, width_px), tuple(K.tolist()), (0.0,) * 5)
+    return CameraModel(None, (height_px, width_px), tuple(K.tolist()), (0.0,) * 5)
 
 
 _READERS: Final[Mapping[str, Callable[[Row, Known, str | None], Iterator[Item]]]] = {

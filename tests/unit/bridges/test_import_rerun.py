@@ -190,6 +190,7 @@ def test_what_is_left_out_is_said(store, tmp_path):
             at(stream, k)
             stream.log("cam", rr.Pinhole(focal_length=50, width=6, height=4, camera_xyz=VIEW))
             stream.log("cam", rr.Image(np.full((4, 6, 3), k, np.uint8)))
+            stream.log("other", rr.Pinhole(focal_length=99, width=6, height=4))
             stream.log("deep", rr.DepthImage(np.full((4, 6), k, np.uint16), meter=1000.0))
             stream.log("points", rr.Points3D([[0, 0, 1]], labels=["a"]))
         stream.disconnect()
@@ -203,11 +204,14 @@ def test_what_is_left_out_is_said(store, tmp_path):
     report = import_rrd(both, store, ImportAttributes(mapping={"camera_head": "/cam"}))
     K = store.recording("both").attributes.calibration["K_head"]
     assert K == ((50, 0, 3), (0, 50, 2), (0, 0, 1))
+    # A pinhole is of its entity and of those below, not of others beside it.
+    assert "K_deep" not in store.recording("both").attributes.calibration
     notes = {one.source: one.notes for one in report.imported}
     assert "1000 are one metre" in notes["/deep"][0]
     assert notes["/points"] == ("left out: labels",)
     reasons = {one.source: one.reason for one in report.refused}
     assert reasons["/cam"] == "left out: camera_xyz"
+    assert reasons["/other"] == "no images of (4, 6) pixels at or below it"
     assert "only the first, 'first', is imported" in reasons["second"]
 
 

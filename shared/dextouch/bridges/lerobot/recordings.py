@@ -247,16 +247,15 @@ def _image_stream(
     read = partial(frames.source.images, frames.entry, key)
     form, dtype, shape, _ = compressed_form(next(read()))
     declared = frames.feature(key).numbers()
+    where = f"{frames.source.folder}: episode {frames.entry.index}: {key!r}"
     if shape[:2] != declared[:2]:
         raise CorruptDataError(
-            f"{frames.source.folder}: episode {frames.entry.index}: {key!r} has images of "
-            f"{list(shape)}, info.json declares {list(declared)}"
+            f"{where} has images of {list(shape)}, info.json declares {list(declared)}"
         )
     stored = form if unit is None or len(shape) < 3 else unit
     keeps = form == stored and stored in ENCODED_UNITS
     descriptor = _descriptor(frames, name, "image", shape=shape, dtype=dtype, unit=stored)
     fresh = np.diff(stamps_ns, prepend=stamps_ns[0] - 1) > 0
-    where = f"{frames.source.folder}: episode {frames.entry.index}: {key!r}"
 
     def blocks() -> Iterator[Block]:
         encoded = _same_form(read(), (form, dtype, shape), where)
@@ -389,8 +388,7 @@ def frame_times(
     said_s = source.numbers(entry, "timestamp").astype(np.float64)
     if not np.isfinite(said_s).all() or np.abs(said_s).max() > 1e9:
         raise CorruptDataError(
-            f"{where}: timestamp has numbers up to {np.abs(said_s).max():g}, expected seconds from "
-            "the start of the episode; --fps RATE takes the frames' numbers instead"
+            f"{where}: timestamp goes to {np.abs(said_s).max():g}, expected seconds; see --fps RATE"
         )
     if (np.diff(said_s) <= 0).any():
         raise CorruptDataError(
