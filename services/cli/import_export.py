@@ -10,7 +10,6 @@ from pydantic import ValidationError
 
 from dextouch.bridges.formats import FORMATS
 from dextouch.command_line import progress, write_result
-from dextouch.data_folder import is_system_file
 from dextouch.episodes import (
     Attributes,
     EpisodeReader,
@@ -259,7 +258,7 @@ def _import(options: argparse.Namespace) -> Report:
     store, path = EpisodeStore(options.store), options.path
     if not path.exists():
         raise NotFoundError(f"{path}: no such file or folder")
-    from dextouch.bridges.import_recording import find_format
+    from dextouch.bridges.import_recording import files_of, find_format
 
     form = options.format or find_format(path)
     check_format_options(import_parser(), options, form)
@@ -282,8 +281,7 @@ def _import(options: argparse.Namespace) -> Report:
         for name, reason in result.failed.items():
             print(f"{path}: {name}: not imported: {reason}", file=sys.stderr)
         return about | result.as_json()
-    found = sorted(path.glob(f"*.{form}")) if path.is_dir() else [path]
-    files = [file for file in found if file == path or not is_system_file(file.name)]
+    files = files_of(path, form) if path.is_dir() else [path]
     if not files:
         raise NotFoundError(f"{path}: holds no .{form} file")
     import_file = _import_apart if form == "rrd" else _import_file
@@ -300,8 +298,7 @@ def _import(options: argparse.Namespace) -> Report:
         reports.append(report)
         print(*(report.lines() if report.imported else [report.recording_id]), sep="\n")
     ids = [report.recording_id for report in reports]
-    files_of = [report.as_json() for report in reports]
-    return about | {"ids": ids, "reports": files_of, "failed": failed}
+    return about | {"ids": ids, "reports": [r.as_json() for r in reports], "failed": failed}
 
 
 def _import_file(

@@ -14,6 +14,7 @@ from pydantic import ValidationError
 from dextouch import __version__
 from dextouch.bridges.export_files import Block
 from dextouch.bridges.formats import FILE_SIGNATURES
+from dextouch.data_folder import is_system_file
 from dextouch.episodes import EpisodeStore, EpisodeWriter, disk_errors
 from dextouch.errors import ConflictError, InvalidInputError, UnknownNameError
 from dextouch.schemas import Domain, ImportedFile, RecordingAttributes, first_problems
@@ -183,7 +184,7 @@ def find_format(path: Path) -> str:
     if path.is_dir():
         if (path / "meta" / "info.json").is_file():
             return "lerobot"
-        forms = [form for form in FILE_SIGNATURES if any(path.glob(f"*.{form}"))]
+        forms = [form for form in FILE_SIGNATURES if files_of(path, form)]
         if len(forms) == 1:
             return forms[0]
         if forms:
@@ -198,6 +199,13 @@ def find_format(path: Path) -> str:
         found = f"a file that begins with {start.hex(' ') or 'nothing'}"
         expected = remedy(path, expected)
     raise InvalidInputError(f"{path}: got {found}; {expected}")
+
+
+def files_of(folder: Path, form: str) -> list[Path]:
+    """Files of a format in a folder, by their names and without those of operating systems."""
+    with disk_errors(f"read {folder}"):
+        found = [path for path in folder.iterdir() if path.suffix.lower() == f".{form}"]
+    return sorted(path for path in found if not is_system_file(path.name))
 
 
 def remedy(path: Path, usual: str = "copy the dataset again") -> str:

@@ -55,12 +55,7 @@ _ENCODINGS: Final = {
     (0, 34): "32FC1",
 }
 # rerun.components.VideoCodec are the four-character codes of MP4.
-_VIDEO_CODECS: Final = {
-    0x61766331: "h264",
-    0x68657631: "h265",
-    0x76703039: "vp9",
-    0x61763031: "av1",
-}
+_VIDEO_CODECS = {0x61766331: "h264", 0x68657631: "h265", 0x76703039: "vp9", 0x61763031: "av1"}
 _CHILD_FROM_PARENT: Final = 2
 _ROW_ID: Final = "rerun.controls.RowId"
 # Values that are remembered of entities whose rows leave some out.

@@ -191,6 +191,12 @@ def test_a_folder_of_two_formats_needs_a_choice(dextouch, tmp_path):
     status, _, err = dextouch("import", tmp_path)
     assert status
     assert "choose one with --format" in err
+    # Names in capitals are of the format, too; those of operating systems are not.
+    (tmp_path / "a.mcap").rename(tmp_path / "A.MCAP")
+    (tmp_path / "._b.mcap").write_bytes(b"")
+    _, _, err = dextouch("import", "--format", "mcap", tmp_path)
+    assert "A.MCAP: is not an MCAP file" in err
+    assert "choose one" in dextouch("import", tmp_path)[2]
 
 
 def test_what_was_rejected_in_review_is_left_out_unless_it_is_asked_for(store, dextouch, tmp_path):
