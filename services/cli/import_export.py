@@ -226,10 +226,10 @@ def _paths(ids: Sequence[str], options: argparse.Namespace) -> dict[str, Path]:
 
 
 def _end_mcap(exported: Sequence[Attributes], options: argparse.Namespace) -> Report:
-    from dextouch.bridges.export_files import wall_offset_ns
     from dextouch.bridges.foxglove import write_layout
+    from dextouch.bridges.mcap import has_wall_times
 
-    num_undated = sum(wall_offset_ns(about) is None for about in exported)
+    num_undated = sum(not has_wall_times(about) for about in exported)
     if num_undated:
         print(
             f"{num_undated} of {len(exported)} do not know when they were recorded (created_at, or "

@@ -110,6 +110,11 @@ def export_mcap(
         return _Export(reader, writer, jpeg_quality).run(touch_images=touch_images)
 
 
+def has_wall_times(about: Attributes) -> bool:
+    """Whether it is known when an item began, so that an export has Unix times."""
+    return wall_offset_ns(about) is not None
+
+
 # Log time, order of the channel among equal ones, publish time, counter and bytes of a message.
 _Timed = tuple[int, int, int, int, bytes]
 
@@ -149,13 +154,8 @@ class _Export:
         sources = [self._messages(*one) for one in enumerate(channels)]
         num_messages = self._write_calibrations()
         for log_time, order, publish_time, sequence, data in heapq.merge(*sources):
-            self._writer.add_message(
-                channel_id=self._channel_ids[order],
-                log_time=log_time,
-                publish_time=publish_time,
-                sequence=sequence,
-                data=data,
-            )
+            channel = self._channel_ids[order]
+            self._writer.add_message(channel, log_time, data, publish_time, sequence)
             num_messages += 1
         finish: Callable[[], None] = self._writer.finish
         finish()
