@@ -517,8 +517,8 @@ def _seen_by(
         return beside or in_frame
     if below := [one for one in images if f"{one.source}/".startswith(f"{source}/")]:
         return below
-    beside = sum(one.rpartition("/")[0] == folder for one in calibrations)
-    if model.frame is None or (len(calibrations) > 1 and (not folder or beside > 1)):
+    num_beside = sum(one.rpartition("/")[0] == folder for one in calibrations)
+    if model.frame is None or (len(calibrations) > 1 and (not folder or num_beside > 1)):
         return []
     return [one for one in images if one.source.startswith(f"{folder}/")]
 
