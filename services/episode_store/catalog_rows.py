@@ -9,15 +9,8 @@ from typing import Any, Final
 import numpy as np
 import structlog
 
-from dextouch import schemas
-from dextouch.episodes import (
-    EpisodeReader,
-    EpisodeStore,
-    GroupFingerprint,
-    Kind,
-    RecordingReader,
-    has_object_poses,
-)
+from dextouch import episodes, schemas
+from dextouch.episodes import EpisodeReader, EpisodeStore, GroupFingerprint, Kind, RecordingReader
 from dextouch.errors import CorruptDataError
 from services.episode_store.filters import (
     EQUALITY_FILTERS,
@@ -188,7 +181,10 @@ def _is_clickable(reader: EpisodeReader) -> bool:
     about = reader.attributes
     if about.origin != "recorded" or about.success is None or about.recovered:
         return False
-    return reader.num_steps > 0 and "camera_head" in reader.streams and not has_object_poses(reader)
+    if not reader.num_steps or "camera_head" not in reader.streams:
+        return False
+    # Imported with what finds objects, only where an item is read.
+    return not episodes.has_object_poses(reader)
 
 
 def _shared_fields(reader: EpisodeReader | RecordingReader) -> dict[str, Any]:
@@ -208,14 +204,9 @@ def write_row(connection: sqlite3.Connection, row: ItemRow) -> None:
     """Put an item in the place of an earlier one of its name; `relink` must follow."""
     execute = connection.execute
     execute("DELETE FROM item WHERE kind = :kind AND id = :id", row.item)
-    execute(
-        "INSERT OR IGNORE INTO grp (task, domain, origin, kind) "
-        "VALUES (:task, :domain, :origin, :kind)",
-        row.item,
-    )
     (group,) = execute(
-        "SELECT number FROM grp WHERE (task, domain, origin, kind) = "
-        "(:task, :domain, :origin, :kind)",
+        "INSERT INTO grp (task, domain, origin, kind) VALUES (:task, :domain, :origin, :kind) "
+        "ON CONFLICT DO UPDATE SET kind = kind RETURNING number",
         row.item,
     ).fetchone()
     number = _insert(connection, "item", {**row.item, "grp": group})

@@ -59,6 +59,8 @@ TAIL_BYTES = 1 << 16
 MAX_READ_AHEAD = 8
 _TAIL = -1
 CLAIM_FILE = "claim"
+# An empty object of each change, which catalogs list instead of all items.
+CHANGES = ".changes"
 # A hash that no content has, so that nothing is written while a group is deleted.
 _DELETING = b"deleting"
 # Uploads older than this count as abandoned.
@@ -256,6 +258,16 @@ class ObjectStorage:
         """Ids of a kind; takes one request per 1000 of them."""
         return dict.fromkeys(self._bucket.folders(f"{kind}s"), 0)
 
+    def changes(self) -> dict[str, tuple[Kind, str]]:
+        """See `EpisodeStore.changes`; takes one request per 1000 changes."""
+        found = (facts.key.split("/") for facts in self._bucket.list(CHANGES))
+        return {
+            parts[3]: (kind, parts[2])
+            for parts in found
+            for kind in KINDS
+            if len(parts) == 4 and parts[1] == f"{kind}s"
+        }
+
     def fingerprints(self, kind: Kind, numbers: Mapping[str, int]) -> dict[str, GroupFingerprint]:
         """Entity tags of what a catalog is made of: of few ids one by one, of many from a list."""
         is_few = len(numbers) <= _MAX_ONE_BY_ONE
@@ -279,6 +291,7 @@ class ObjectStorage:
         group = group_key(kind, item_id)
         self._bucket.put(f"{group}/{CLAIM_FILE}", _DELETING)
         self._bucket.remove([f"{group}/{COMMIT_FILE}"])
+        _announce(self._bucket, group)
         _remove_files(self._bucket, group, [facts.key for facts in self._bucket.list(group)])
 
     def set_remark(self, kind: Kind, item_id: str, name: str, content: bytes | None) -> None:
@@ -288,6 +301,7 @@ class ObjectStorage:
             self._bucket.remove([key])
         else:
             self._bucket.put(key, content)
+        _announce(self._bucket, group_key(kind, item_id))
 
     def get_file(self, name: str) -> bytes | None:
         """An object beside the groups; None if it does not exist."""
@@ -403,6 +417,8 @@ def upload_group(bucket: Bucket, kind: Kind, folder: Path) -> None:
         _claim(bucket, group, content, name)
         if not bucket.put(f"{group}/{COMMIT_FILE}", commit, create=True):
             _is_committed(bucket, group, content, name)
+    # Also after a kill between both: what is still here is uploaded again.
+    _announce(bucket, group)
     with disk_errors(f"remove what was uploaded of {name}"):
         # First, so that the remainder after a kill does not pass for a group.
         (folder / COMMIT_FILE).unlink()
@@ -412,7 +428,8 @@ def upload_group(bucket: Bucket, kind: Kind, folder: Path) -> None:
 def sweep_orphans(bucket: Bucket, *, now: datetime | None = None) -> int:
     """Remove objects of abandoned uploads and deletions, and return the number of groups.
 
-    The whole bucket is listed. ORPHAN_AGE counts back from `now`, the present by default.
+    The whole bucket is listed. ORPHAN_AGE counts back from `now`, the present by default. Changes
+    of that age are removed, too, except the last one.
     """
     limit = (datetime.now(UTC) if now is None else now) - ORPHAN_AGE
     removed = 0
@@ -430,7 +447,14 @@ def sweep_orphans(bucket: Bucket, *, now: datetime | None = None) -> int:
             if bucket.head(f"{group}/{COMMIT_FILE}") is None:
                 _remove_files(bucket, group, keys)
                 removed += 1
+    changes = sorted(bucket.list(CHANGES), key=lambda facts: facts.modified)
+    bucket.remove([facts.key for facts in changes[:-1] if facts.modified < limit])
     return removed
+
+
+def _announce(bucket: Bucket, group: str) -> None:
+    """Tell catalogs that a group was changed."""
+    bucket.put(f"{CHANGES}/{group}/{uuid.uuid4().hex}", b"")
 
 
 def _claim(bucket: Bucket, group: str, content: str, name: str) -> None:
