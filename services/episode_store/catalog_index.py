@@ -63,6 +63,7 @@ _IS_DIRTY: Final = """SELECT EXISTS (SELECT 1 FROM item WHERE is_dirty)
   OR EXISTS (SELECT 1 FROM grp WHERE is_stale)"""
 # A fingerprint as it is in a row; of many rows, names of its parts would take as long as the query.
 Known = tuple[int, str, str]
+_NONE: Final[Known] = (-1, "", "")
 Progress = Callable[[list[str], str, int], Iterable[str]]
 Write = Callable[[sqlite3.Connection], None]
 
@@ -223,17 +224,17 @@ class CatalogIndex:
         """Bring rows up to date with the ids that were found; returns as `_apply`."""
         known, wanted = self._rows(connection, kind), found
         if not is_check:
-            wanted = {
-                name: number
-                for name, number in found.items()
-                if name not in known or known[name][0] != number
-            }
+            before = known.get
+            wanted = {n: number for n, number in found.items() if before(n, _NONE)[0] != number}
         current = self._store.fingerprints(wanted, kind=kind)
         is_done = True
         if not is_check or current != known:
-            names = known.keys() if is_check else (known.keys() - found.keys()) | wanted.keys()
-            before = {name: known[name] for name in names if name in known}
-            is_done = self._apply(connection, kind, before, current, again=is_check)
+            names = set(wanted)
+            # Otherwise all that are known were found.
+            if len(found) - len(names - known.keys()) < len(known):
+                names |= known.keys() - found.keys()
+            compared = {name: known[name] for name in names if name in known}
+            is_done = self._apply(connection, kind, compared, current, again=is_check)
         self._is_checked[kind] |= is_check
         return is_done
 

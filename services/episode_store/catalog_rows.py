@@ -101,7 +101,10 @@ def read_row(
     at = at and within_calendar(at)
     item = item_of(reader, summary)
     is_clickable = isinstance(reader, EpisodeReader) and _is_clickable(reader)
-    review, clicks = read_remarks(store, kind, item_id)
+    review, clicks = None, None
+    # Without its stamp there is none.
+    if fingerprint.remarks.strip():
+        review, clicks = read_remarks(store, kind, item_id)
     parts = (item_id, about.task, about.instruction, about.operator, about.station, about.trace_id)
     names = ("kind", "id", *EQUALITY_FILTERS, "complete", "duration_s")
     columns: dict[str, object] = {name: getattr(item, name) for name in names}

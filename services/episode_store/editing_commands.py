@@ -13,7 +13,7 @@ from dextouch.command_line import say
 from dextouch.episodes import EpisodeReader, EpisodeStore, Kind, editing
 from dextouch.errors import DexTouchError, InvalidInputError, NotFoundError
 from dextouch.geometry import transform_from_pose
-from dextouch.schemas import EditedItem, NewNote, TimedNote, first_problems, json_ready
+from dextouch.schemas import EditedItem, NewNote, first_problems, json_ready
 from services.episode_store.command_context import Context, Outcome, table
 
 EXIT_REFUSED = 1
@@ -183,13 +183,9 @@ def note(context: Context) -> Outcome:
         editing.remove_note(store, options.id, options.remove, kind=kind)
     notes = store.notes(options.id, kind=kind).notes
     for one in notes:
-        say(_note_line(one, zero))
+        span = f"{(one.start_ns - zero) / 1e9:.3f} … {(one.stop_ns - zero) / 1e9:.3f} s"
+        say(f"{one.number}  {span}  {one.author or '-'}  {one.text}")
     return {"notes": [json_ready(one) for one in notes]}, 0
-
-
-def _note_line(one: TimedNote, zero: int) -> str:
-    span = f"{(one.start_ns - zero) / 1e9:.3f} … {(one.stop_ns - zero) / 1e9:.3f} s"
-    return f"{one.number}  {span}  {one.author or '-'}  {one.text}"
 
 
 def clicks(context: Context) -> Outcome:

@@ -245,9 +245,11 @@ class ObjectStorage:
 
     def num_bytes(self, kind: Kind, item_id: str) -> int:
         """Size of a committed group in the bucket."""
-        if not self.exists(kind, item_id):
+        group = group_key(kind, item_id)
+        sizes = {facts.key: facts.size for facts in self._bucket.list(group)}
+        if f"{group}/{COMMIT_FILE}" not in sizes:
             raise self._missing(kind, item_id)
-        return sum(facts.size for facts in self._bucket.list(group_key(kind, item_id)))
+        return sum(sizes.values())
 
     def list(self, kind: Kind) -> list[str]:
         """Sorted committed ids; takes one request per 1000 objects in the bucket."""
