@@ -184,10 +184,8 @@ def _is_clickable(reader: EpisodeReader) -> bool:
     about = reader.attributes
     if about.origin != "recorded" or about.success is None or about.recovered:
         return False
-    if not reader.num_steps or "camera_head" not in reader.streams:
-        return False
-    # Imported with what finds objects, only where an item is read.
-    return not episodes.has_object_poses(reader)
+    has_images = reader.num_steps > 0 and "camera_head" in reader.streams
+    return has_images and not episodes.has_object_poses(reader)
 
 
 def _shared_fields(reader: EpisodeReader | RecordingReader) -> dict[str, Any]:

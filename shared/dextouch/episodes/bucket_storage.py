@@ -12,7 +12,7 @@ import threading
 import uuid
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, nullcontext, suppress
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -262,7 +262,7 @@ class ObjectStorage:
 
     def changes(self) -> dict[str, tuple[Kind, str]]:
         """See `EpisodeStore.changes`; takes one request per 1000 changes."""
-        found = (facts.key.split("/") for facts in self._bucket.list(CHANGES))
+        found = (facts.key.split("/") for facts in _announced(self._bucket))
         return {
             parts[3]: (kind, parts[2])
             for parts in found
@@ -449,14 +449,23 @@ def sweep_orphans(bucket: Bucket, *, now: datetime | None = None) -> int:
             if bucket.head(f"{group}/{COMMIT_FILE}") is None:
                 _remove_files(bucket, group, keys)
                 removed += 1
-    changes = sorted(bucket.list(CHANGES), key=lambda facts: facts.modified)
+    changes = sorted(_announced(bucket), key=lambda facts: facts.modified)
     bucket.remove([facts.key for facts in changes[:-1] if facts.modified < limit])
     return removed
 
 
 def _announce(bucket: Bucket, group: str) -> None:
-    """Tell catalogs that a group was changed."""
-    bucket.put(f"{CHANGES}/{group}/{uuid.uuid4().hex}", b"")
+    """Tell catalogs that a group was changed; without the permission they find it by its id."""
+    try:
+        bucket.put(f"{CHANGES}/{group}/{uuid.uuid4().hex}", b"")
+    except StorageError as error:
+        logger.warning("change_not_announced", group=group, reason=error.message)
+
+
+def _announced(bucket: Bucket) -> builtins.list[ObjectFacts]:
+    with suppress(StorageError):
+        return builtins.list(bucket.list(CHANGES))
+    return []
 
 
 def _claim(bucket: Bucket, group: str, content: str, name: str) -> None:

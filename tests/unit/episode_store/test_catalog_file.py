@@ -18,6 +18,7 @@ from structlog.testing import capture_logs
 from dextouch.episodes import EpisodeStore
 from dextouch.episodes.bucket_storage import ORPHAN_AGE, sweep_orphans, upload_group
 from dextouch.episodes.maintenance import DeletionRequest, delete_for_good
+from dextouch.episodes.s3_bucket import Bucket
 from dextouch.errors import StorageError
 from dextouch.schemas import Review
 from services.episode_store import catalog_file, catalog_index, command_line
@@ -442,3 +443,25 @@ def test_an_item_that_cannot_be_read_is_looked_at_by_other_processes(
         assert ids(catalog) == ["a"]
     assert [entry["id"] for entry in logs] == ["b"]
     assert ids(Catalog(store)) == ["a", "b"]
+
+
+def test_a_bucket_whose_policy_allows_items_alone(in_bucket, monkeypatch, now_ns):
+    ours, theirs = in_bucket("ours"), in_bucket("theirs")
+    for method in ("put", "list"):
+        whole = getattr(Bucket, method)
+
+        def refused(self, key, *args, _f=whole, **options):
+            if key.startswith(".changes"):
+                raise StorageError(f"write {key}: refused (403 AccessDenied)")
+            return _f(self, key, *args, **options)
+
+        monkeypatch.setattr(Bucket, method, refused)
+    with capture_logs() as logs:
+        upload_item(theirs, "episode", "a")
+    assert [entry["event"] for entry in logs] == ["change_not_announced"]
+    catalog = Catalog(ours)
+    assert ids(catalog) == ["a"]
+    upload_item(theirs, "episode", "b")
+    now_ns[0] += catalog_index.BUCKET_PERIOD_NS
+    assert ids(catalog) == ["a", "b"]
+    assert ours.sweep() == 0
