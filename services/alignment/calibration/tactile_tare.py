@@ -293,9 +293,9 @@ class TactileCalibration:
         state = np.full(len(cells), ABSENT, dtype=np.uint8)
         has_cell = cells != NO_CELL
         state[has_cell] = _states(record, f"{glove}_taxel_state", num_cells)[cells[has_cell]]
-        good = state == OK
+        good = (state == OK) & (gain[cells] > 0)
         is_known = layout is None or layout.unit == "counts"
-        if is_known and num_cells == about.num_raw_cells and (gain[cells[good]] > 0).any():
+        if is_known and num_cells == about.num_raw_cells and good.any():
             why = implausible_gain(gain[cells[good]], about.areas_m2[good], about)
             if why is not None:
                 text = f"calibration '{glove}_gain_counts_per_kpa': {why}"

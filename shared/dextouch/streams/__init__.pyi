@@ -13,6 +13,7 @@ from .bodies import COMMANDED as COMMANDED
 from .bodies import MOUNTS as MOUNTS
 from .bodies import ToBody as ToBody
 from .bodies import implausible_bodies as implausible_bodies
+from .hand_traces import HandTraces as HandTraces
 from .packing import pack as pack
 from .packing import pack_openpi as pack_openpi
 from .packing import unpack as unpack

@@ -192,9 +192,10 @@ def _check_commanded(bodies: _Bodies) -> ImplausibleBody | None:
     for name, other in zip(WRISTS, WRISTS[::-1], strict=True):
         if len(bodies.sent.get(name + COMMANDED, ())) < MIN_BODY_SAMPLES:
             continue
-        swapped = bodies.changed(_TURNS[_XYZW], name)
-        shares = bodies.as_commanded(name), swapped.as_commanded(name)
-        if found := _compared(name, "turned as commanded", shares, _XYZW):
+        turns = [(bodies.changed(_TURNS[one], name).as_commanded(name), one) for one in _TURNS]
+        share, turn = max(turns)
+        shares = bodies.as_commanded(name), share
+        if found := _compared(name, "turned as commanded", shares, turn):
             return found
         off_m = bodies.apart_m(name, name + COMMANDED)
         if off_m > MAX_LAG_M > bodies.apart_m(other, name + COMMANDED):
