@@ -27,8 +27,8 @@ ZERO_PARTS: Final = 8
 MIN_DRIFT_KPA: Final = 0.75 * CONTACT_THRESHOLD_KPA
 MAX_PART_OF_DRIFT: Final = 0.5
 MAX_UNLIKE: Final = 0.35
-# Converters end at a power of two. Elsewhere three taxels that end at the same reading share a
-# limit: it is read in so many samples, and more often than all that is within 2 % below.
+# Three taxels that end at the same reading share a limit, two where converters end (2^n - 1): it is
+# read in so many samples, and more often than all that is within 2 % below.
 MIN_TOP_ROWS: Final = 30
 MIN_TOP_SHARE: Final = 0.02
 NEAR_TOP: Final = 0.98
@@ -96,12 +96,8 @@ class TaxelBlocks:
         step: float = 1.0,
         layout: TactileLayout = DEXTOUCH_V1,
     ) -> None:
-        self._gain, self._usable, self._step, self._layout = (
-            gain_counts_per_kpa,
-            usable,
-            step,
-            layout,
-        )
+        self._gain, self._usable = gain_counts_per_kpa, usable
+        self._step, self._layout = step, layout
         self._dithers: list[np.ndarray] = []
         self._num_dithered = self._num_own = 0
         self._lows: list[np.ndarray] = []
@@ -171,21 +167,18 @@ class TaxelBlocks:
         flat &= (self._num_top > self._num_near) & self._usable
         tops, inverse, same = np.unique(self._top, return_inverse=True, return_counts=True)
         same = np.bincount(inverse, weights=flat, minlength=len(tops))
-        is_limit = (same >= MIN_SAME_TOPS) | np.isin(tops, CEILINGS)
+        is_limit = same >= np.where(np.isin(tops, CEILINGS), 2, MIN_SAME_TOPS)
         is_limit |= tops >= self._layout.full_scale - self._step / 2
         return np.asarray(flat & is_limit[inverse])
 
     def ghosts(self) -> Bool[np.ndarray, " taxels"]:
         """Taxels of rows that hold a part of another row."""
         kpa = np.concatenate(self._kept) if self._kept else np.zeros((0, len(self._gain)))
+        # The last column stands for no taxel between.
+        kpa = np.pad(kpa, ((0, 0), (0, 1)), constant_values=np.inf)
         shares = [
-            (
-                _ghost_share(
-                    kpa[:, one], kpa[:, other], np.where(between < 0, np.inf, kpa[:, between])
-                ),
-                other,
-            )
-            for one, other, between in _pairs_of_rows(self._layout)
+            (_ghost_share(*(kpa[:, some] for some in rows)), rows[1])
+            for rows in _pairs_of_rows(self._layout)
         ]
         found = np.zeros(len(self._gain), dtype=bool)
         for share, other in sorted(shares, key=lambda of: -of[0]):
