@@ -22,7 +22,8 @@ ALONE: Final = 1 / 3
 MIN_HITS: Final = 4
 MAX_OWN_SHARE: Final = 0.1
 # A tracker stands still if means of half seconds differ as those of white noise do (1, with a
-# scatter of 0.5), in all columns, while fingers of its hand open or close by so much.
+# scatter of 0.5), in all columns, while fingers of its hand open or close by so much. Poses without
+# any noise were filled in, not tracked.
 MAX_SLOW: Final = 3.0
 MIN_CLOSING_M: Final = 0.02
 LEAST_NOISE: Final = 1e-6
@@ -98,6 +99,8 @@ class HandTraces:
         rows = np.stack([*self._bins[wrist].values()])
         count, (some, squares) = rows[:, :1], np.split(rows[:, 1:], 2, axis=1)
         noise = (squares - some**2 / count).sum(axis=0) / count.sum()
+        if noise.max() < LEAST_NOISE**2:
+            return False
         noise = np.maximum(noise, LEAST_NOISE**2)
         slow = ((some / count - some.sum(axis=0) / count.sum()) ** 2 * count).mean(axis=0) / noise
         return bool(closing_m > MIN_CLOSING_M and slow.max() < MAX_SLOW)
