@@ -27,6 +27,8 @@ MAX_OWN_SHARE: Final = 0.1
 MAX_SLOW: Final = 3.0
 MIN_CLOSING_M: Final = 0.02
 LEAST_NOISE: Final = 1e-6
+# Tremor moves every hand by more (m, and parts of quaternions).
+LEAST_LIFE: Final = np.array([2e-4] * 3 + [1e-3] * 4)
 
 
 class HandTraces:
@@ -103,7 +105,9 @@ class HandTraces:
             return False
         noise = np.maximum(noise, LEAST_NOISE**2)
         slow = ((some / count - some.sum(axis=0) / count.sum()) ** 2 * count).mean(axis=0) / noise
-        return bool(closing_m > MIN_CLOSING_M and slow.max() < MAX_SLOW)
+        least = np.ptp(some / count, axis=0).reshape(7) / LEAST_LIFE
+        is_still = slow.max() < MAX_SLOW or least.max() < 1
+        return bool(closing_m > MIN_CLOSING_M and is_still)
 
     def _exchanged_pads(self, side: str) -> tuple[str, str] | None:
         names = f"tactile_{side}", f"keypoints_{side}"

@@ -67,6 +67,9 @@ def test_a_tracker_that_stands_still_while_its_fingers_move(noise_m):
         poses = streams["wrist_left"]
         poses[:] = poses[0] + noise_m * rng.standard_normal(poses.shape)
         assert found(streams) == {"wrist_left": "frozen"}
+        # Filtered noise is not white.
+        poses[:] = poses[0] + 2e-4 * gaussian_filter1d(poses - poses[0], 60, axis=0) / noise_m
+        assert found(streams) == {"wrist_left": "frozen"}
         # Nobody knows whether a hand whose fingers rest is still.
         streams["keypoints_left"][:] = streams["keypoints_left"][0]
         assert "wrist_left" not in found(streams)
