@@ -35,10 +35,10 @@ def hands(seed, *, seconds=40):
         keypoints += 5e-4 * rng.standard_normal(keypoints.shape)
         waves = gaussian_filter1d(rng.standard_normal((count, 6)), 40, axis=0)
         poses = np.zeros((count, 7))
-        poses[:, :3] = 1e-3 * waves[:, :3] / waves.std()
-        poses[:, 3:] = np.pad(0.01 * waves[:, 3:] / waves.std(), ((0, 0), (1, 0)))
+        # A hand at rest: what it moves is as much as the noise.
+        poses[:, :3] = 3e-4 * (waves[:, :3] / waves.std() + rng.standard_normal((count, 3)))
+        poses[:, 4:] = 1e-3 * (waves[:, 3:] / waves.std() + rng.standard_normal((count, 3)))
         poses[:, 3] = 1
-        poses[:, :3] += 3e-4 * rng.standard_normal((count, 3))
         poses[:, 3:] /= np.linalg.norm(poses[:, 3:], axis=1, keepdims=True)
         streams |= {f"keypoints_{side}": keypoints, f"wrist_{side}": poses, f"tactile_{side}": kpa}
     return streams
