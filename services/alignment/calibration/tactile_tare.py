@@ -427,9 +427,11 @@ def unusable_taxels(
     """Why each taxel of a take is unusable, index into `REASONS`; 0 if usable.
 
     Besides those that the calibration refuses: dead, stuck, random, a copy of another cell, mostly
-    below the tare, still while those around them move, or NaN in more than a tenth of the samples.
-    Raises InvalidInputError: more than half of the taxels are random, copied, dead, stuck or below
-    their tare, some read more than any finger presses, or all more than their tare.
+    below the tare, still while those around them move, at a limit for long, on a pad that drifts or
+    in a row with a ghost of another one, or NaN in more than a tenth of the samples.
+    Raises InvalidInputError: more than half of the taxels are random, copied, dead, stuck, at a
+    limit, drifting or below their tare, all are frozen, some read more than any finger presses, or
+    all more than their tare.
     """
     reasons = calibration.state.copy()
     if take.num_samples < MIN_SAMPLES_TO_JUDGE:
