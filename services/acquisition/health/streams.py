@@ -13,12 +13,15 @@ from dextouch.schemas import Matrix
 from dextouch.streams import (
     BODIES,
     MOUNTS,
+    TAXEL_UNIT,
+    HandTraces,
     Sample,
     StreamDescriptor,
     implausible_bodies,
     implausible_values,
 )
 from services.acquisition.drivers.base import Driver
+from services.acquisition.health.cells import NO_CELL, GloveRecord, glove_record, is_ours
 from services.acquisition.health.evaluation import (
     WINDOW_NS,
     Block,
@@ -58,6 +61,8 @@ MIN_REST_SAMPLES = 40
 PLAUSIBLE_NS = 5_000_000_000
 # Poses of bodies that are compared of that time.
 MAX_COMPARED = 100
+# Half seconds in which motion and touch of hands are compared.
+HAND_BINS = 120
 # What is kept between two evaluations, which are a second apart.
 KEPT_S = 4.0
 JUDGED_VALUES = ("tactile", "pose", "keypoints", "robot_state")
@@ -321,6 +326,42 @@ class BodiesCheck:
         found = implausible_bodies(poses, to_body, of_robot=False)
         if found is not None and found.stream == name:
             evaluation.findings.append(Finding("implausible", "ERROR", found.message))
+
+
+class HandsCheck:
+    """Judges whether wrists and gloves of the last minute go with their hands, as alignment does.
+
+    One for all of a person's devices; `calibration` has tares and gains of the gloves.
+    """
+
+    def __init__(self, calibration: Mapping[str, Matrix]) -> None:
+        self._calibration = calibration
+        self._traces = HandTraces(HAND_BINS)
+
+    def of(self, descriptor: StreamDescriptor) -> Callable[[Evaluation], None]:
+        """The check of one stream."""
+        record = glove_record(descriptor, self._calibration) if is_ours(descriptor) else None
+        return partial(self._judge, descriptor, record)
+
+    def _judge(
+        self, descriptor: StreamDescriptor, record: GloveRecord | None, evaluation: Evaluation
+    ) -> None:
+        block, layout = evaluation.block, None
+        if block.values is None or not len(block):
+            return
+        values = block.values
+        if descriptor.kind == "tactile":
+            layout = descriptor.tactile_layout
+            if record is not None:
+                kpa = (values - record.tare_counts) / record.gain_counts_per_kpa
+                values = np.where(record.cells == NO_CELL, 0.0, kpa[:, record.cells])
+            elif descriptor.unit != TAXEL_UNIT:
+                return
+        self._traces.add(descriptor.name, block.t_host_ns, values, layout)
+        cause, message = self._traces.found().get(descriptor.name, ("", ""))
+        if cause:
+            code = "frozen" if cause == "frozen" else "implausible"
+            evaluation.findings.append(Finding(code, "ERROR", message))
 
 
 def _mounted(poses: np.ndarray, T: np.ndarray) -> np.ndarray:

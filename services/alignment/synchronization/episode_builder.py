@@ -21,6 +21,7 @@ from dextouch.schemas import (
 from dextouch.streams import (
     BODIES,
     COMMANDED,
+    HandTraces,
     Implausible,
     StreamDescriptor,
     implausible_bodies,
@@ -149,6 +150,22 @@ def check_bodies(streams: Mapping[str, DatedStream], domain: Domain) -> None:
         )
 
 
+def check_hands(streams: Mapping[str, DatedStream]) -> None:
+    """Refuse wrists and gloves that do not go with their hands; raises InvalidInputError."""
+    traces = HandTraces()
+    if not any(name.startswith("keypoints") for name in streams):
+        return
+    for name, stream in streams.items():
+        if name.startswith(("keypoints", "tactile")) or name in BODIES[1:]:
+            about = stream.descriptor
+            layout = about.tactile_layout if about.kind == "tactile" else None
+            for piece in stream.pieces():
+                traces.add(name, piece.t_ns, piece.values, layout)
+    for name, (cause, message) in traces.found().items():
+        text = f"stream {name!r}: {message}, and record again"
+        raise InvalidInputError(text, fault=cause, stream=name)
+
+
 def _left_out(
     stream: DatedStream, found: list[Implausible]
 ) -> tuple[DatedStream, tuple[tuple[int, int, RefusedReason], ...]]:
@@ -255,6 +272,7 @@ def build_episode(
     }
     streams = {name: one.stream for name, one in checked.items()}
     check_bodies(streams, recording.attributes.domain)
+    check_hands(streams)
     span = find_span(recording, checked, options, on_progress)
     on_progress(progress_within("retargeting", 0.0))
     source, gridded = recording.attributes, span.gridded

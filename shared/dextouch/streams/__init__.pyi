@@ -13,6 +13,7 @@ from .bodies import COMMANDED as COMMANDED
 from .bodies import MOUNTS as MOUNTS
 from .bodies import ToBody as ToBody
 from .bodies import implausible_bodies as implausible_bodies
+from .hand_traces import HandTraces as HandTraces
 from .packing import pack as pack
 from .packing import pack_openpi as pack_openpi
 from .packing import unpack as unpack
@@ -47,6 +48,8 @@ from .samples import check_encoded_image as check_encoded_image
 from .samples import check_follows as check_follows
 from .samples import encoded_values as encoded_values
 from .samples import residual_limits_s as residual_limits_s
+from .taxel_blocks import drifting_taxels as drifting_taxels
+from .taxel_blocks import implausible_gain as implausible_gain
 from .taxel_faults import MIN_SAMPLES_TO_JUDGE as MIN_SAMPLES_TO_JUDGE
 from .taxel_faults import TaxelFaults as TaxelFaults
 from .taxel_faults import neighbour_share as neighbour_share

@@ -372,11 +372,12 @@ def test_taxels_that_are_random_from_some_moment_on():
     assert reasons_of(calibration, counts)[REASONS[RANDOM]].tolist() == list(range(20))
 
 
-def test_a_press_at_full_scale_and_a_frozen_glove_condemn_no_taxel():
+def test_a_press_at_full_scale_ends_there_and_a_frozen_glove_condemns_no_taxel():
     _, calibration = glove()
     counts = readings(calibration)
     counts[600:, calibration.cells[100:140]] = 65535
-    assert reasons_of(calibration, counts) == {}
+    found = reasons_of(calibration, counts)
+    assert {name: of.tolist() for name, of in found.items()} == {"saturated": [*range(100, 140)]}
     counts = readings(calibration)
     counts[700:] = counts[700]
     assert reasons_of(calibration, counts) == {}
