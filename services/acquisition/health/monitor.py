@@ -352,6 +352,8 @@ def _watch(
         elif not descriptor.capabilities.sequence:
             judges.append(CountingCheck(descriptor))
         judges += _value_judges(driver, descriptor, calibration)
+        if descriptor.kind == "image":
+            judges.append(CameraCheck(driver, descriptor.name, bodies))
         if bodies is not None and descriptor.name in BODIES:
             judges.append(bodies.of(descriptor.name))
         if "occluded" in driver.events():
@@ -384,7 +386,7 @@ def _value_judges(
         return [PoseCheck(descriptor), PlausibilityCheck(descriptor, of_robot=of_robot)]
     if descriptor.kind == "robot_state":
         return [PlausibilityCheck(descriptor)]
-    return [CameraCheck(driver)] if descriptor.kind == "image" else []
+    return []
 
 
 def _device_health(supervisor: DeviceSupervisor, *, simulated: bool) -> schemas.DeviceHealth:

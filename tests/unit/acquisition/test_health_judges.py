@@ -283,6 +283,7 @@ class CheckedDriver(Driver):
     ("change", "code"),
     [
         ({"frozen": True}, "image_frozen"),
+        ({"fault": "torn"}, "image_content"),
         ({"blurred": True}, "image_blurred"),
         ({"gap": True}, "image_gap"),
         ({"clipped_ratio": 0.3}, "image_clipped"),
@@ -290,7 +291,7 @@ class CheckedDriver(Driver):
 )
 def test_bad_images_warn_and_are_an_error_after_a_second(change, code):
     driver = driver_of(PoseTrackerDecoder("head"), CheckedDriver)
-    judge = CameraCheck(driver)
+    judge = CameraCheck(driver, "camera_head")
     assert judged(judge, block([]), 0).findings == []
     driver.quality = ImageQuality(**change)
     seen = [codes(judged(judge, block([]), t * SECOND_NS)) for t in (1, 2)]
