@@ -184,7 +184,8 @@ class ImageChecker:
         stop, self._num_new = len(self._pictures) - LATER_PICTURES, 0
         faults, judged = image_faults(np.stack(self._pictures)), slice(stop - NEW_PICTURES, stop)
         new = {name: int(m[judged].sum()) for name, m in faults.items() if m[judged].any()}
-        found.fault = max(new, key=new.__getitem__) if new else None
+        rising = sorted(new, key=new.__getitem__)
+        found.fault = rising[-1] if rising else None
         found.num_faulty += sum(new.values())
 
     def look(self, image: UInt8[np.ndarray, "h w 3"]) -> None:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int64
+from jaxtyping import Float32, Float64, Int64
 
 from dextouch.geometry import interpolate_poses, invert
 from dextouch.geometry.rotations import rotation_angle
@@ -41,10 +41,10 @@ MIN_WEIGHT: Final = 0.2
 # Predicted flow of an image, RMS, below which a camera stands still: 0.5 px of VGA at 500 px.
 MIN_FLOW_RAD: Final = 1e-3
 MIN_VIEW_IMAGES: Final = 60
-# Lags that are tried, and what makes one sure: what it explains more than none does, its sigmas,
+# Lags that are tried, and what makes one sure: its share of what is left without it, its sigmas,
 # and its size, as cameras without a calibrated latency are as late as an image takes.
 MAX_LAG_S, LAG_STEP_S = 0.4, 0.01
-MIN_GAIN, LAG_SIGMAS, MIN_LAG_S = 0.05, 4.0, 0.035
+MIN_GAIN, LAG_SIGMAS, MIN_LAG_S = 0.25, 4.0, 0.035
 NUM_PARTS: Final = 6
 # While a camera turns by so much in a second, or moves past what is a metre away, its picture is
 # off by 30 px of VGA at 500 px, and changes by more than noise does; in so many images at least.
@@ -155,21 +155,21 @@ def view_faults(name: str, view: View, motions: Mapping[str, CameraMotion]) -> V
     # Across a pause there is no flow.
     known = np.diff(view.t_ns) < 2 * np.median(np.diff(view.t_ns))
     flow, predicted = view.flow()[known], motion.flow(view.t_ns)[known]
+    lags = _Lags(view.t_ns, flow, motion, known)
     shares = {turn: _explained(flow, predicted, turn) for turn in TURNS}
-    if shares[_AS_READ] > WRONG_SHARE:
-        return ViewFaults(still_share, lag_s=_lag_s(view.t_ns, flow, motion, known))
     others = {n: _explained(flow, one.flow(view.t_ns)[known]) for n, one in motions.items()}
-    best, like = max(shares.values()), max(others, key=lambda n: others[n])
-    if others[like] > max(RIGHT_SHARE, best):
+    turn, like = max(shares, key=shares.__getitem__), max(others, key=others.__getitem__)
+    # What is late may look turned in a motion to and fro.
+    least = max(RIGHT_SHARE, shares[_AS_READ] + MIN_APART, lags.share + WRONG_SHARE)
+    if others[like] > max(least, shares[turn]):
         return ViewFaults(still_share, like=like)
-    turn = max(shares, key=lambda one: shares[one])
     halves = np.array_split(np.arange(len(flow)), 2)
-    if best < RIGHT_SHARE or not all(
+    if shares[turn] > least and all(
         _explained(flow[p], predicted[p], turn) > _explained(flow[p], predicted[p]) for p in halves
     ):
-        return ViewFaults(still_share)
-    least = max(shares[_AS_READ], best - MIN_APART)
-    return ViewFaults(still_share, " or ".join(t for t in TURNS if shares[t] > least))
+        near = (one for one in TURNS if shares[one] > shares[turn] - MIN_APART)
+        return ViewFaults(still_share, " or ".join(near))
+    return ViewFaults(still_share, lag_s=lags.sure(shares[_AS_READ]))
 
 
 def _still_share(view: View, motion: CameraMotion) -> float | None:
@@ -182,27 +182,33 @@ def _still_share(view: View, motion: CameraMotion) -> float | None:
     return float((changed < STILL_NOISE * noise_levels(view.pictures)).mean())
 
 
-def _lag_s(
-    t_ns: np.ndarray, flow: np.ndarray, motion: CameraMotion, known: Bool[np.ndarray, " steps"]
-) -> tuple[float, float] | None:
-    """The lag at which the motion explains most, with its sigma by leaving out parts."""
-    lags_s = np.arange(-MAX_LAG_S, MAX_LAG_S + LAG_STEP_S / 2, LAG_STEP_S)
-    predicted = [motion.flow(t_ns - round(lag_s * 1e9))[known] for lag_s in lags_s]
+class _Lags:
+    """The lag at which a camera's motion explains most of a flow, and how much that is."""
 
-    def best(rows: np.ndarray) -> tuple[float, float, float]:
-        shares = np.array([_explained(flow[rows], one[rows]) for one in predicted])
+    def __init__(
+        self, t_ns: np.ndarray, flow: np.ndarray, motion: CameraMotion, known: np.ndarray
+    ) -> None:
+        self._flow = flow
+        self._lags_s = np.arange(-MAX_LAG_S, MAX_LAG_S + LAG_STEP_S / 2, LAG_STEP_S)
+        self._predicted = [motion.flow(t_ns - round(lag * 1e9))[known] for lag in self._lags_s]
+        self.lag_s, self.share = self._best(np.arange(len(flow)))
+
+    def _best(self, rows: np.ndarray) -> tuple[float, float]:
+        shares = np.array([_explained(self._flow[rows], one[rows]) for one in self._predicted])
         top = int(shares[1:-1].argmax()) + 1
         before, at, after = shares[top - 1 : top + 2].tolist()
         offset = 0.5 * (before - after) / min(before - 2 * at + after, -1e-12)
-        return lags_s[top] + np.clip(offset, -0.5, 0.5) * LAG_STEP_S, at, shares[len(shares) // 2]
+        return float(self._lags_s[top] + np.clip(offset, -0.5, 0.5) * LAG_STEP_S), at
 
-    rows = np.arange(len(flow))
-    lag_s, share, without = best(rows)
-    if not MIN_LAG_S < abs(lag_s) < MAX_LAG_S - 2 * LAG_STEP_S:
-        return None
-    if share < RIGHT_SHARE or share - without < MIN_GAIN:
-        return None
-    # The jackknife; a grid is no more exact than a tenth of its step.
-    left_out = [best(np.setdiff1d(rows, part))[0] for part in np.array_split(rows, NUM_PARTS)]
-    sigma_s = max(float(np.sqrt((NUM_PARTS - 1) * np.var(left_out))), LAG_STEP_S / 10)
-    return (float(lag_s), sigma_s) if abs(lag_s) > LAG_SIGMAS * sigma_s else None
+    def sure(self, without: float) -> tuple[float, float] | None:
+        """The lag and its sigma if it explains much of what is left `without` one."""
+        if not MIN_LAG_S < abs(self.lag_s) < MAX_LAG_S - 2 * LAG_STEP_S:
+            return None
+        if self.share < RIGHT_SHARE or self.share - without < MIN_GAIN * (1 - without):
+            return None
+        # The jackknife; a grid is no more exact than a tenth of its step.
+        rows = np.arange(len(self._flow))
+        parts = np.array_split(rows, NUM_PARTS)
+        left_out = [self._best(np.setdiff1d(rows, part))[0] for part in parts]
+        sigma_s = max(float(np.sqrt((NUM_PARTS - 1) * np.var(left_out))), LAG_STEP_S / 10)
+        return (self.lag_s, sigma_s) if abs(self.lag_s) > LAG_SIGMAS * sigma_s else None

@@ -32,13 +32,14 @@ DARK_LEVEL, LIT_LEVEL = 8.0, 30.0
 FILLS: Final = (128.0, 0.0, 135.0)
 EVEN_LEVELS: Final = 1.0
 MIN_ROWS: Final = 3
-# Rows of another image are off both neighbours by times what these are off each other, and more.
-ALIEN, ALIEN_LEVELS = 3.0, 8.0
+# Rows of another image are off both neighbours by times what these are off each other, and more:
+# in a motion that goes on they are off by half of it.
+ALIEN, ALIEN_LEVELS = 1.6, 8.0
 # An older image comes again from a buffer of so many.
 MAX_BUFFER: Final = 32
 # Motion that goes on makes two steps of a picture longer than one. Of alternating cameras and
 # exchanged images two steps are shorter, by this factor at least.
-BACK_SHARE: Final = 0.7
+BACK_SHARE: Final = 0.8
 # Light of all blocks alike changes by so much in one image, both ways, in a second of pumping.
 PUMPED: Final = 0.04
 MIN_PUMPED: Final = 2
@@ -46,11 +47,13 @@ MIN_PUMPED: Final = 2
 
 def thumbnail(image: UInt8[np.ndarray, "h w c"]) -> Float32[np.ndarray, "24 32"]:
     """Mean levels of blocks of an image: of its green, or of its only channel."""
-    plane = image[..., image.shape[2] // 2]
-    for axis, count in enumerate((ROWS * _SAMPLES, COLUMNS * _SAMPLES)):
-        size = plane.shape[axis]
-        plane = plane.take((2 * np.arange(count) + 1) * size // (2 * count), axis=axis)
-    return plane.reshape(ROWS, _SAMPLES, COLUMNS, _SAMPLES).mean(axis=(1, 3), dtype=np.float32)
+    rows, columns = (
+        (2 * np.arange(count * _SAMPLES) + 1) * size // (2 * count * _SAMPLES)
+        for count, size in zip(PICTURE_SHAPE, image.shape, strict=False)
+    )
+    chosen = image[rows[:, None], columns, image.shape[2] // 2]
+    blocks = chosen.reshape(ROWS, _SAMPLES, COLUMNS, _SAMPLES).sum(axis=1, dtype=np.uint16)
+    return blocks.sum(axis=-1, dtype=np.uint16) / np.float32(_SAMPLES * _SAMPLES)
 
 
 def apart(some: np.ndarray, others: np.ndarray) -> np.ndarray:
@@ -82,9 +85,9 @@ def image_faults(
         steps, two = (apart(pictures[by:], pictures[:-by]) for by in (1, 2))
         noise = noise_levels(pictures)
         rest: dict[ImageFault, np.ndarray] = {
+            "mixed": _mixed(steps, two, noise),
             "torn": _alien(pictures),
             "older": _older(pictures, steps, noise),
-            "mixed": _mixed(steps, two, noise),
             "pumping": _pumping(pictures),
         }
         taken = np.zeros(count, dtype=bool)
@@ -120,9 +123,10 @@ def _alien(pictures: np.ndarray) -> Bool[np.ndarray, " n"]:
     two = np.abs(pictures[2:] - pictures[:-2]).mean(axis=2)
     alien = np.minimum(step[:-1], step[1:]) > ALIEN * two + ALIEN_LEVELS
     count = alien.sum(axis=1)
-    whole = [np.cumprod(rows, axis=1).sum(axis=1) == count for rows in (alien, alien[:, ::-1])]
-    torn = (whole[0] | whole[1]) & (count >= MIN_ROWS) & (count <= ROWS - MIN_ROWS)
-    return np.pad(torn, 1)
+    # From the first such row down, or from the last one up; some may look alike.
+    heights = [ROWS - rows.argmax(axis=1) for rows in (alien, alien[:, ::-1])]
+    torn = count >= 0.75 * np.minimum(*heights)
+    return np.pad(torn & (count >= MIN_ROWS) & (count <= ROWS - MIN_ROWS), 1)
 
 
 def _older(pictures: np.ndarray, steps: np.ndarray, noise: float) -> Bool[np.ndarray, " n"]:
