@@ -75,10 +75,7 @@ def image_faults(
         return found
     means = pictures.mean(axis=(1, 2))
     found["black"] = (means < DARK_LEVEL) & (np.median(means) > LIT_LEVEL)
-    last = pictures[:, -MIN_ROWS:].reshape(count, -1)
-    filled = (np.ptp(last, axis=1) < EVEN_LEVELS) & _is_fill(last.mean(axis=1))
-    # What is so in most images is the scene.
-    found["torn"] = filled & ~found["black"] & (filled.mean() < 0.5)
+    found["torn"] = _filled(pictures[:, -MIN_ROWS:].reshape(count, -1)) & ~found["black"]
     ordinary = np.flatnonzero(~found["black"] & ~found["torn"])
     pictures = pictures[ordinary]
     if len(pictures) >= _LEAST_IMAGES:
@@ -97,9 +94,15 @@ def image_faults(
     return {name: marked for name, marked in found.items() if marked.any()}
 
 
-def _is_fill(levels: np.ndarray) -> Bool[np.ndarray, " n"]:
-    """Levels near those that decoders write where data ends."""
-    return np.asarray((np.abs(levels[:, None] - FILLS) < 3 * EVEN_LEVELS).any(axis=1))
+def _filled(last: np.ndarray) -> Bool[np.ndarray, " n"]:
+    """Pictures whose `last` rows are what decoders fill in, unlike those of both neighbours."""
+    near_fill = (np.abs(last.mean(axis=1)[:, None] - FILLS) < 3 * EVEN_LEVELS).any(axis=1)
+    unlike = np.zeros(len(last), dtype=bool)
+    # A scene that looks so, such as a plain wall, stays for more than an image or two.
+    for by in (1, 2):
+        differs = np.abs(last[by:] - last[:-by]).mean(axis=1) > ALIEN_LEVELS
+        unlike[by:-by] |= differs[:-by] & differs[by:]
+    return near_fill & unlike & (np.ptp(last, axis=1) < EVEN_LEVELS)
 
 
 def noise_levels(pictures: Float32[np.ndarray, "n 24 32"]) -> float:
