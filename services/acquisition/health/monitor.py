@@ -353,6 +353,9 @@ def _watch(
         elif not descriptor.capabilities.sequence:
             judges.append(CountingCheck(descriptor))
         judges += _value_judges(driver, descriptor, calibration)
+        if descriptor.kind == "image":
+            bodies = None if person is None else person[0]
+            judges.append(CameraCheck(driver, descriptor.name, bodies))
         if person is not None and descriptor.name in BODIES:
             judges.append(person[0].of(descriptor.name))
         if person is not None and descriptor.name.startswith(("keypoints", "tactile", "wrist")):
@@ -387,7 +390,7 @@ def _value_judges(
         return [PoseCheck(descriptor), PlausibilityCheck(descriptor, of_robot=of_robot)]
     if descriptor.kind == "robot_state":
         return [PlausibilityCheck(descriptor)]
-    return [CameraCheck(driver)] if descriptor.kind == "image" else []
+    return []
 
 
 def _device_health(supervisor: DeviceSupervisor, *, simulated: bool) -> schemas.DeviceHealth:

@@ -31,6 +31,7 @@ from dextouch.streams import (
 from dextouch.tactile.layout import common_layout
 from services.alignment.settings import AlignmentOptions
 from services.alignment.synchronization import OnProgress, progress_within
+from services.alignment.synchronization.checked_images import check_views, looked_at
 from services.alignment.synchronization.grid_actions import (
     ACTION_STREAMS,
     TOUCH_STREAMS,
@@ -266,6 +267,8 @@ def build_episode(
     streams = _dated_streams(recording, on_progress)
     _check_hands(recording, streams)
     streams = with_tracked_objects(streams, objects, recording.attributes.calibration)
+    looked = {n: looked_at(one) for n, one in streams.items() if one.descriptor.kind == "image"}
+    streams |= {name: stream for name, (stream, _) in looked.items()}
     checked = {
         name: checked_stream(stream, max_gap_ns=options.longest_bridge_ns)
         for name, stream in streams.items()
@@ -273,6 +276,11 @@ def build_episode(
     streams = {name: one.stream for name, one in checked.items()}
     check_bodies(streams, recording.attributes.domain)
     check_hands(streams)
+    views = check_views(
+        {name: view for name, (_, view) in looked.items()},
+        streams,
+        recording.attributes.calibration,
+    )
     span = find_span(recording, checked, options, on_progress)
     on_progress(progress_within("retargeting", 0.0))
     source, gridded = recording.attributes, span.gridded
@@ -305,6 +313,7 @@ def build_episode(
         "origin_after_start_ns": float(span.origin_ns - (source.started_t_host_ns or 0)),
         **_stream_quality(streams, options),
         **actions.quality,
+        **views,
     }
     attributes = _episode_attributes(recording, episode_id, actions, streams, quality)
     listed = () if objects is None else objects.tasks[source.task]
