@@ -112,13 +112,15 @@ class Bundle:
     """The mount X, the target's pose Z in the world, the scale, and how well they are known.
 
     `scale` is true over measured lengths of the second series. The covariance is of the twists of
-    X, then of Z (rad, m, in their own frames), then of log scale; zero for what was given.
+    X, then of Z (rad, m, in their own frames), then of log scale; zero for what was given. It is
+    `excess` times that of independent errors.
     """
 
     X: Float64[np.ndarray, "4 4"]
     Z: Float64[np.ndarray, "4 4"]
     scale: float
     covariance: Float64[np.ndarray, "13 13"]
+    excess: float = 1.0
 
 
 def weighted_bundle(
@@ -158,7 +160,7 @@ def weighted_bundle(
     Ts[:, :3, 3] /= bundle.scale
     left_over = (whiten @ twist(invert(series.Ts_mounted_target) @ Ts)[..., None])[..., 0]
     excess = excess_over_time(series, left_over, whiten @ J, whiten @ C, free, declared)
-    return replace(bundle, covariance=excess * bundle.covariance), sigmas
+    return replace(bundle, covariance=excess * bundle.covariance, excess=excess), sigmas
 
 
 def sensor_components(
