@@ -36,6 +36,8 @@ SMALLEST_NOISE_STEP = 1e-3
 PRIOR_LOG_SIGMA = 1.4
 # Lower bound of a variance, as a share of the declared one.
 MIN_SHARE = 1e-6
+# Of the expected variance of the scale, below which the views alone determine it.
+MAX_SCALE_SHARE = 0.1
 # A pose that is known worse than this is of no use (one sigma, three axes together).
 MAX_SIGMA_ROTATION_RAD = np.deg2rad(0.5)
 MAX_SIGMA_TRANSLATION_M = 0.01
@@ -159,6 +161,9 @@ def weighted_bundle(
     J, C = predicted_jacobians(Ts, bundle.X @ Ts, bundle.scale)
     Ts[:, :3, 3] /= bundle.scale
     left_over = (whiten @ twist(invert(series.Ts_mounted_target) @ Ts)[..., None])[..., 0]
+    if bundle.covariance[12, 12] < MAX_SCALE_SHARE * scale_sigma**2:
+        # What was expected leaves nothing of it in the residuals.
+        free = free[free < 12]
     excess = excess_over_time(series, left_over, whiten @ J, whiten @ C, free, declared)
     return replace(bundle, covariance=excess * bundle.covariance, excess=excess), sigmas
 

@@ -264,14 +264,14 @@ def check_sides(series: Series, errors: np.ndarray) -> None:
     if not fits:
         return
     length_m, name, again = min(fits, key=lambda fit: fit[0])
-    other = (
+    fixed_camera = (
         "; or the camera stands still and the tracker is on the board, which is not calibrated here"
     )
     raise InvalidInputError(
         f"{series.task}: {name} is probably inverted: the views contradict each other by "
         f"{_rms_text(errors)} RMS as given and by {_rms_text(again)} when {name} is turned round "
         f"(the mount is then {length_m * 1e3:.0f} mm long); pass the inverse of each matrix of "
-        f"{name}{other if name == 'Ts_camera_board' else ''}",
+        f"{name}{fixed_camera if name == 'Ts_camera_board' else ''}",
         inverted=name,
     )
 
@@ -466,7 +466,8 @@ def _excess_by_pose(
     T = invert(series.Ts_mounted_target)
     poses = twist(invert(nearest_pose(T)) @ T)
     found = _change(left, fitted, (J[:, :, :6, None] * poses[:, None, None]).reshape(left.size, -1))
-    squares = np.square(poses @ found.coefficients.reshape(6, 6).T).mean(axis=0)
+    explained = (left - found.remaining).reshape(-1, 6, 1)
+    squares = np.square(np.linalg.solve(J[:, :, :6], explained)[..., 0]).mean(axis=0)
     lengths = np.sqrt(squares.reshape(2, 3).sum(axis=1))
     is_large = lengths > MIN_CHANGE * np.sqrt(3) * np.array(expected)
     if found.p_value < MAX_CHANCE and is_large.any():
