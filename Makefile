@@ -15,7 +15,7 @@ SITE := build/docs
 export OMP_NUM_THREADS ?= 1
 
 SCREENS ?= build/screens
-.PHONY: demo test test-long check slow from-recordings browser screens kills vm containers fuzz mutants fix clean docs bench stress bench-lerobot check-lerobot-export check-lerobot-policy check-openpi check-api-client check-ray check-environments check-zarr-readers wheel-test vendor release \
+.PHONY: demo test test-long check slow from-recordings browser screens kills vm containers fuzz mutants fix clean docs bench gpu stress bench-lerobot check-lerobot-export check-lerobot-policy check-openpi check-api-client check-ray check-environments check-zarr-readers wheel-test vendor release \
 	reproduce reproduce-checkpoints
 .DEFAULT_GOAL := demo
 
@@ -84,6 +84,9 @@ bench: $(VENV)/.dev      ## measure time and error of each stage; STAGE=clocks A
 	@missed=; for stage in $(STAGE); do echo "== $$stage"; \
 	$(BIN)/python -m benchmarks $$stage --out runs/bench $(ARGS) || missed="$$missed $$stage"; done; \
 	if [ -n "$$missed" ]; then echo "make bench: failed:$$missed" >&2; exit 1; fi
+
+gpu: $(VENV)/.dev        ## train and serve the full size with random weights on one CUDA card, in minutes; needs torch for CUDA
+	$(BIN)/python -m benchmarks gpu --out runs/gpu $(ARGS)
 
 stress: $(VENV)/.dev     ## check every stage against numerical hazards; ARGS="--quick", or names of stages
 	$(BIN)/python -m benchmarks stress $(ARGS)

@@ -3,6 +3,7 @@
 import argparse
 import statistics
 import time
+from collections import defaultdict
 from collections.abc import Mapping
 from contextlib import nullcontext
 from functools import partial
@@ -22,6 +23,7 @@ from benchmarks.rollouts.ways import (
     compared,
     crowd,
     opened,
+    processor_s,
     resting_actions,
 )
 from benchmarks.stages import Amounts, Bar
@@ -33,6 +35,9 @@ LAST: Final = ReturnSelector(steps="last")
 JPEG: Final = ReturnSelector(steps="last", images="jpeg")
 ALL: Final = ReturnSelector(steps="all")
 MAX_OVER_ECHO: Final = {"HTTP": 1.5, "WebSocket": 1.3}
+# Of the server's processor time of a chunk with the last image.
+MAX_PROCESSOR_US: Final = {"HTTP": 340.0, "WebSocket": 220.0}
+NUM_WARMING: Final = 5
 MAX_DURABLE_MS: Final = 1.0
 MAX_WATCHED: Final = 1.1
 MAX_LISTING_MS: Final = 2.0
@@ -83,7 +88,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     try:
         urls = child.receive()
         ways = [*WAYS, *OTHERS, WATCHED, *([DURABLE] if DURABLE.server in urls else [])]
-        times_s, sizes = timed(urls, ways, plan, bar)
+        times_s, taken_s, sizes = timed(urls, child.pid, ways, plan, bar)
         with bar("32 rollouts", len(DEVICES)) as step:
             crowds = {}
             for world in DEVICES:
@@ -112,7 +117,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         packages=("numpy", "fastapi", "uvicorn", "websockets", "msgpack"),
         options=plan,
         tables=[
-            _table(times_s, over, sizes),
+            _table(times_s, taken_s, over, sizes),
             ResultTable(
                 f"{NUM_ROLLOUTS} rollouts on a device of 5 ms",
                 ("world", "chunks/s", "p50 ms", "p99 ms"),
@@ -123,6 +128,16 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
             *_requirements(times_s, over, crowds),
             *(
                 at_most(
+                    f"{_name(way)}: the server's processor time of a chunk",
+                    # Zero where the system does not count it.
+                    1e6 * taken_s[_name(way)].median or None,
+                    MAX_PROCESSOR_US[way.protocol],
+                    "µs",
+                )
+                for way in (OTHERS[0], WAYS[2])
+            ),
+            *(
+                at_most(
                     f"{listing} {where}, with a new connection, p50", p50_ms, MAX_LISTING_MS, "ms"
                 )
                 for where, p50_ms in listings_ms.items()
@@ -130,6 +145,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         ],
         data={
             "seconds": times_s,
+            "processor_seconds": taken_s,
             "bytes": {_name(way): size for way, size in sizes.items()},
             "bare_step_seconds": {_name(way): bare_s[way.selector] for way in ways},
             "crowds": {world: found._asdict() for world, found in crowds.items()},
@@ -139,34 +155,48 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
             "the world computes nothing; client and server are processes of their own; medians of "
             "the chunks of a round, medians over the rounds; ratios round by round, of a chunk "
             "less the bare step of the world: over HTTP to a bare ASGI echo of the same bytes, "
-            "over the WebSocket to a minimal server that unpacks, steps the same world and packs"
+            "over the WebSocket to a minimal server that unpacks, steps the same world and packs; "
+            "processor times are those of the server's process, medians over the rounds"
         ],
     )
 
 
 def timed(
-    urls: Mapping[str, str], ways: list[Way], plan: Mapping[str, int], bar: Bar
-) -> tuple[dict[str, Figure], dict[Way, int]]:
-    """Seconds of a chunk and of what it is compared with, and bytes of the answers."""
+    urls: Mapping[str, str], pid: int, ways: list[Way], plan: Mapping[str, int], bar: Bar
+) -> tuple[dict[str, Figure], dict[str, Figure], dict[Way, int]]:
+    """Seconds of a chunk and of what it is compared with, and bytes of the answers.
+
+    The second are seconds of all processors that the server's process took.
+    """
     sizes: dict[Way, int] = {}
+    spent_s: dict[str, list[float]] = defaultdict(list)
     for way in ways:
         with opened(urls, way) as chunk:
             sizes[way] = chunk()
 
+    def median_s(name: str, chunk: Chunk) -> float:
+        before_s = processor_s(pid)
+        found_s = _median_s(chunk, plan["chunks"])
+        spent_s[name].append((processor_s(pid) - before_s) / (plan["chunks"] + NUM_WARMING))
+        return found_s
+
     def ours(way: Way, _: int) -> float:
         watching = watched(urls[way.server]) if way.is_watched else nullcontext()
         with watching, opened(urls, way) as chunk:
-            return _median_s(chunk, plan["chunks"])
+            return median_s(_name(way), chunk)
 
     def other(way: Way, _: int) -> float:
         with compared(urls, way, sizes[way]) as chunk:
-            return _median_s(chunk, plan["chunks"])
+            return median_s(f"{_name(way)}, compared", chunk)
 
     subjects = {_name(way): partial(ours, way) for way in ways}
     subjects |= {f"{_name(way)}, compared": partial(other, way) for way in ways}
     with bar("rounds", plan["rounds"] * len(subjects)) as step:
         found = interleaved(subjects, plan["rounds"], on_step=step)
-    return {name: Figure.of(values) for name, values in found.items()}, sizes
+    times_s, taken_s = (
+        {name: Figure.of(values) for name, values in some.items()} for some in (found, spent_s)
+    )
+    return times_s, taken_s, sizes
 
 
 def bare_step_s(selector: ReturnSelector) -> float:
@@ -180,7 +210,7 @@ def bare_step_s(selector: ReturnSelector) -> float:
 
 
 def _median_s(chunk: Chunk, count: int) -> float:
-    for _ in range(5):
+    for _ in range(NUM_WARMING):
         chunk()
     seconds = []
     for _ in range(count):
@@ -239,7 +269,10 @@ def _requirements(
 
 
 def _table(
-    times_s: Mapping[str, Figure], over: Mapping[Way, Figure], sizes: Mapping[Way, int]
+    times_s: Mapping[str, Figure],
+    taken_s: Mapping[str, Figure],
+    over: Mapping[Way, Figure],
+    sizes: Mapping[Way, int],
 ) -> ResultTable:
     rows = [
         (
@@ -248,8 +281,10 @@ def _table(
             times_s[_name(way)].scaled(1e3).text(),
             times_s[f"{_name(way)}, compared"].scaled(1e3).text(),
             figure.text(),
+            taken_s[_name(way)].scaled(1e6).text(),
+            taken_s[f"{_name(way)}, compared"].scaled(1e6).text(),
         )
         for way, figure in over.items()
     ]
-    columns = ("chunk of 16 steps", "kB", "ours ms", "beside ms", "ratio")
+    columns = ("chunk of 16 steps", "kB", "ours ms", "beside ms", "ratio", "server µs", "beside µs")
     return ResultTable("Time of a chunk", columns, rows)

@@ -24,6 +24,7 @@ from dextouch.hands.hand_files import load_hand
 from dextouch.jobs import Workers, run_jobs
 from dextouch.schemas import SceneObjects, json_ready
 from dextouch.serving import load_settings
+from dextouch.streams import IMAGE_FAULTS, STILL_SHARE
 from dextouch.tactile import CONTACT_THRESHOLD_KPA
 from services.alignment.jobs import AlignmentWorker, align_recording, check_recording, episode_id_of
 from services.alignment.retargeting import HandRetargeter, RetargetStatus
@@ -298,6 +299,7 @@ def _implausible(report: AlignmentReport) -> list[str]:
         "norm_samples": "samples without a rotation",
         "limits_samples": "samples beyond limits",
         "repeated_images": "repeated images",
+        **{f"{fault}_samples": text for fault, text in IMAGE_FAULTS.items()},
     }
     found = [
         f"{name.removesuffix(f'_num_{what}')}: {count:.0f} {text}"
@@ -310,6 +312,13 @@ def _implausible(report: AlignmentReport) -> list[str]:
         for name, kpa in report.quality.items()
         if name.endswith("_highest_zero_kpa") and kpa > CONTACT_THRESHOLD_KPA
     ]
+    for name, figure in report.quality.items():
+        camera, figures = name.removesuffix("_lag_s"), report.quality
+        if name.endswith("_lag_s") and f"{camera}_lag_sigma_s" in figures:
+            late = f"{figure * 1e3:.0f} ± {figures[f'{camera}_lag_sigma_s'] * 1e3:.0f} ms"
+            found.append(f"{camera}: images are {late} later than their times: measure its latency")
+        elif name.endswith("_still_share") and figure > STILL_SHARE:
+            found.append(f"{name.removesuffix('_still_share')}: images stay as they are")
     if num_steps := report.quality.get("num_steps_interpolated"):
         found.append(f"{num_steps:.0f} of {report.num_steps} steps interpolated across gaps")
     return found

@@ -38,6 +38,7 @@ SECTIONS: Final = {
     "world_model_train": "world_model.paper_settings:TrainCommand",
     "world_model_train_state": "world_model.settings:TrainStateCommand",
     "world_model_train_tokenizer": "world_model.paper_settings:TrainTokenizerCommand",
+    "world_model_cache": "world_model.paper_settings:CacheCommand",
     "world_model_distill": "world_model.paper_settings:DistillCommand",
     "world_model_adapt": "world_model.paper_settings:AdaptCommand",
     "world_model_adapt_state": "world_model.settings:AdaptStateCommand",

@@ -10,7 +10,6 @@ from pydantic import ValidationError
 
 from dextouch.bridges.formats import FORMATS
 from dextouch.command_line import progress, write_result
-from dextouch.data_folder import is_system_file
 from dextouch.episodes import (
     Attributes,
     EpisodeReader,
@@ -19,7 +18,13 @@ from dextouch.episodes import (
     RecordingReader,
     is_rejected,
 )
-from dextouch.errors import ConflictError, DexTouchError, InvalidInputError, NotFoundError
+from dextouch.errors import (
+    ConflictError,
+    CorruptDataError,
+    DexTouchError,
+    InvalidInputError,
+    NotFoundError,
+)
 from dextouch.schemas import first_problems
 from services.pipelines.parsers import (
     EXPORT_FILTERS,
@@ -253,7 +258,7 @@ def _import(options: argparse.Namespace) -> Report:
     store, path = EpisodeStore(options.store), options.path
     if not path.exists():
         raise NotFoundError(f"{path}: no such file or folder")
-    from dextouch.bridges.import_recording import find_format
+    from dextouch.bridges.import_recording import files_of, find_format
 
     form = options.format or find_format(path)
     check_format_options(import_parser(), options, form)
@@ -276,14 +281,14 @@ def _import(options: argparse.Namespace) -> Report:
         for name, reason in result.failed.items():
             print(f"{path}: {name}: not imported: {reason}", file=sys.stderr)
         return about | result.as_json()
-    found = sorted(path.glob(f"*.{form}")) if path.is_dir() else [path]
-    files = [file for file in found if file == path or not is_system_file(file.name)]
+    files = files_of(path, form) if path.is_dir() else [path]
     if not files:
         raise NotFoundError(f"{path}: holds no .{form} file")
+    import_file = _import_apart if form == "rrd" else _import_file
     reports, failed = [], {}
     for file in progress(files, f"import {form}", len(files)):
         try:
-            report = _import_file(file, store, form, options)
+            report = import_file(file, store, form, options)
         except DexTouchError as error:
             if len(files) == 1:
                 raise
@@ -293,8 +298,7 @@ def _import(options: argparse.Namespace) -> Report:
         reports.append(report)
         print(*(report.lines() if report.imported else [report.recording_id]), sep="\n")
     ids = [report.recording_id for report in reports]
-    files_of = [report.as_json() for report in reports]
-    return about | {"ids": ids, "reports": files_of, "failed": failed}
+    return about | {"ids": ids, "reports": [r.as_json() for r in reports], "failed": failed}
 
 
 def _import_file(
@@ -319,6 +323,24 @@ def _import_file(
     from dextouch.bridges.import_mcap import import_any_mcap
 
     return import_any_mcap(path, store, about)
+
+
+def _import_apart(
+    path: Path, store: EpisodeStore, form: str, options: argparse.Namespace
+) -> "ImportReport":
+    """`_import_file` in a process of its own, since Rerun's reader aborts it at some damage."""
+    from concurrent.futures.process import BrokenProcessPool
+
+    from dextouch.jobs import worker_pool
+
+    with worker_pool(1) as pool:
+        try:
+            return pool.submit(_import_file, path, store, form, options).result()
+        except BrokenProcessPool as error:
+            raise CorruptDataError(
+                f"{path}: rerun-sdk ended its process while reading: the file is damaged, or "
+                "memory ran out; copy it again, or see what `rerun rrd verify` says"
+            ) from error
 
 
 def export_main(argv: Sequence[str]) -> int:

@@ -1,6 +1,7 @@
 """Application of the episode store, with its threads in the background."""
 
 import threading
+import time
 from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
 from functools import partial
@@ -38,6 +39,7 @@ logger = structlog.get_logger(__name__)
 ENROLMENTS_FILE = "enrolments.json"
 # Chosen: an operator waits no longer after an outage, and a bucket that is away gets few requests.
 RETRY_PERIOD_S: Final = 30.0
+SWEEP_PERIOD_S: Final = 24 * 3600.0
 TRASH_PERIOD_S: Final = 3600.0
 # How soon a deletion reaches an upload that nobody continues.
 WATCH_PERIOD_S: Final = 1.0
@@ -91,11 +93,11 @@ class PeriodicThread:
 
 
 class PendingUploads(PeriodicThread):
-    """Uploads what waits in a store's outbox, and removes the stages of killed writers once."""
+    """Uploads what waits in a store's outbox, and sweeps the store once a day."""
 
     def __init__(self, store: EpisodeStore, *, period_s: float = RETRY_PERIOD_S) -> None:
         super().__init__("uploads_not_completed", period_s, self.work)
-        self._store, self._is_swept = store, False
+        self._store, self._sweep_at_s = store, 0.0
 
     def work(self) -> None:
         """Try once.
@@ -104,9 +106,9 @@ class PendingUploads(PeriodicThread):
         """
         for kind, item_id in self._store.complete_uploads():
             logger.warning("upload_completed", kind=kind, id=item_id)
-        if not self._is_swept:
+        if time.monotonic() >= self._sweep_at_s:
             removed = self._store.sweep()
-            self._is_swept = True
+            self._sweep_at_s = time.monotonic() + SWEEP_PERIOD_S
             if removed:
                 logger.info("unfinished_writes_removed", count=removed)
 

@@ -12,7 +12,7 @@ from typing import Any, Final, NamedTuple, TypeVar
 import numpy as np
 
 from dextouch import schemas
-from dextouch.episodes import KINDS, EpisodeStore, Kind
+from dextouch.episodes import EpisodeStore, Kind
 from dextouch.errors import NotFoundError
 from services.episode_store.catalog_index import CatalogIndex, Progress
 from services.episode_store.filters import (
@@ -68,7 +68,7 @@ _PRODUCTS: Final = """SELECT i.row, p.id
   FROM item i CROSS JOIN lineage l ON l.kind = 'recording' AND l.source = i.id
     AND (l.sha256 IS NULL OR l.sha256 = i.sha256)
   CROSS JOIN item p ON p.row = l.row AND p.kind = 'episode' AND p.origin <> 'imagined'
-  WHERE i.kind = 'recording' AND i.row IN (SELECT value FROM json_each(?))
+  WHERE +i.kind = 'recording' AND i.row IN (SELECT value FROM json_each(?))
   ORDER BY p.id, l.position"""
 
 
@@ -139,24 +139,21 @@ class Catalog:
         where = Condition(terms=["i.kind = ?"], values=[kind])
         query.restrict(where)
         text = f"SELECT {', '.join(ListedRow._fields)} FROM item i WHERE {where.sql} ORDER BY i.id"
-        return self.index.read(lambda c: list(map(ListedRow._make, c.execute(text, where.values))))
+        return self.index.read(
+            lambda c: list(map(ListedRow._make, c.execute(text, where.values))), kind
+        )
 
     def values(self) -> schemas.CatalogValues:
         """Tasks, operators and stations that occur, at most MAX_VALUES of each."""
+        # Of each name, kind and review there is a row.
+        text = "SELECT DISTINCT {0} FROM tally WHERE {0} > '' ORDER BY 1 LIMIT ?"
 
         def read(connection: sqlite3.Connection) -> schemas.CatalogValues:
-            found: dict[str, tuple[str, ...]] = {}
-            for name in ("task", "operator", "station"):
-                key = _KEYS[name]
-                # From one value to the next, over the index.
-                text = f"""WITH RECURSIVE v(x) AS (
-                  SELECT min({key}) FROM item i WHERE kind = :kind UNION ALL
-                  SELECT (SELECT min({key}) FROM item i WHERE kind = :kind AND {key} > x)
-                  FROM v WHERE x IS NOT NULL LIMIT {MAX_VALUES + 2})
-                  SELECT x FROM v WHERE x > ''"""
-                rows = (row for kind in KINDS for row in connection.execute(text, {"kind": kind}))
-                found[f"{name}s"] = tuple(sorted({value for (value,) in rows})[:MAX_VALUES])
-            return schemas.CatalogValues(**found)
+            found = {
+                f"{name}s": [row[0] for row in connection.execute(text.format(name), (MAX_VALUES,))]
+                for name in ("task", "operator", "station")
+            }
+            return schemas.CatalogValues.model_validate(found)
 
         return self.index.read(read)
 
@@ -280,7 +277,7 @@ class Catalog:
     def bytes_by_station(self) -> dict[str, int]:
         """Disk usage of finished recordings by station."""
         text = "SELECT station, sum(num_bytes) FROM item WHERE kind = 'recording' GROUP BY station"
-        return dict(self.index.read(lambda connection: connection.execute(text).fetchall()))
+        return dict(self.index.read(lambda c: c.execute(text).fetchall(), "recording"))
 
 
 @dataclass(frozen=True)
@@ -312,10 +309,10 @@ def _page(
 ) -> tuple[list[Found], dict[str, Any]]:
     """The rows of a page, and the number of all that match with the cursor to go on after."""
     limit = min(limit, MAX_LIMIT)
-    found = f"SELECT i.row, i.aligned, {order.key} AS k, {order.name} AS n FROM {where.tables}"
+    found = f"SELECT i.row, i.aligned, {order.key} AS k, {order.name} AS n FROM item i"
     place = [limit + 1, min(order.page.offset, MAX_LIMIT)]
     if not where.is_rare:
-        count = f"SELECT count(*) FROM {where.tables} WHERE {where.sql}"
+        count = f"SELECT count(*) FROM item i WHERE {where.sql}"
         if where.is_counted:
             count = f"SELECT coalesce(sum(num), 0) FROM tally i WHERE {where.sql}"
         (num_matching,) = connection.execute(count, where.values).fetchone()

@@ -13,14 +13,13 @@ from typing import Final
 
 import structlog
 
-from dextouch.episodes import held_folder
-from dextouch.episodes.maintenance import CATALOG_FOLDER, remove_catalog
+from dextouch.episodes import CATALOG_FOLDER, held_folder, remove_catalog
 from services.episode_store.filters import COUNTED_ATTRIBUTES, NO_WEIGHT, SORT_COLUMNS
 
 logger = structlog.get_logger(__name__)
 
 # To be incremented with any change of the tables, or of what is read of an item.
-VERSION: Final = 3
+VERSION: Final = 4
 # How long a process waits for another one that writes: longer than linking 100,000 items takes.
 BUSY_S: Final = 30.0
 _DAMAGED: Final = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
@@ -29,7 +28,8 @@ _UNUSABLE: Final = (
     *_DAMAGED, sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_READONLY, sqlite3.SQLITE_FULL,
     sqlite3.SQLITE_IOERR, sqlite3.SQLITE_BUSY, sqlite3.SQLITE_PROTOCOL,
 )  # fmt: skip
-# Of all items of a kind, and of takes.
+# Of all items of a kind, and of takes. `take_name` has all columns that takes are filtered by
+# figures with.
 _INDEXES: Final = "".join(
     f"CREATE INDEX kind_{name} ON item(kind, {key}, name);"
     f"CREATE INDEX take_{name} ON item({key}, name) WHERE is_take;"
@@ -92,15 +92,17 @@ CREATE TABLE tally (
   take_verdict TEXT, num INTEGER NOT NULL DEFAULT 0, duration_ns INTEGER NOT NULL DEFAULT 0);
 CREATE INDEX tally_key ON tally({", ".join(_COUNTED)});
 CREATE TABLE fact (name TEXT PRIMARY KEY, value INTEGER NOT NULL) WITHOUT ROWID;
+CREATE TABLE announced (name TEXT PRIMARY KEY) WITHOUT ROWID;
 CREATE INDEX lineage_source ON lineage(source, kind);
 CREATE INDEX result_id ON result(id);
 CREATE INDEX item_dirty ON item(is_dirty) WHERE is_dirty;
 CREATE INDEX item_group ON item(grp, is_compared);
 CREATE INDEX item_aligned ON item(aligned) WHERE aligned IS NOT NULL;
-CREATE INDEX item_hours ON item(kind, task, domain, origin, success, duration_s);
+CREATE INDEX item_hours ON item(kind, at_us, verdict, duration_s);
+CREATE INDEX item_text ON item(text);
 CREATE INDEX item_clickable ON item(id) WHERE is_clickable;
 CREATE INDEX kind_name ON item(kind, name);
-CREATE INDEX take_name ON item(name) WHERE is_take;
+CREATE INDEX take_name ON item(name, aligned, is_take) WHERE is_take;
 CREATE INDEX kind_findings ON item(kind, weight, name);
 CREATE INDEX take_verdict ON item(take_verdict, name) WHERE is_take;
 CREATE INDEX take_findings ON item(take_weight, name) WHERE is_take;
@@ -173,20 +175,15 @@ class CatalogFile:
     def _open(self) -> sqlite3.Connection:
         if not self._is_given_up and (self._is_bucket or self._root.is_dir()):
             try:
-                with self._locked():
+                self._folder.mkdir(exist_ok=True, parents=self._is_bucket)
+                self._give_to_owner(self._folder)
+                # No other process opens or creates a file meanwhile.
+                with held_folder(self._folder):
                     return self._open_file()
             except (OSError, sqlite3.Error) as error:
                 self.give_up(error)
         self.path = None
         return _created(":memory:")
-
-    @contextmanager
-    def _locked(self) -> Iterator[None]:
-        """No other process opens or creates a file meanwhile."""
-        self._folder.mkdir(exist_ok=True, parents=self._is_bucket)
-        self._give_to_owner(self._folder)
-        with held_folder(self._folder):
-            yield
 
     def _open_file(self) -> sqlite3.Connection:
         for path in sorted(self._folder.glob(f"{self._prefix}*.sqlite")):

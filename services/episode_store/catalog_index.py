@@ -4,8 +4,10 @@ What is noticed when:
 
 - a look, before each query: items that were committed, deleted, restored or replaced. It costs one
   `stat` while the folder of a kind is unchanged, one listing without a `stat` of each item
-  otherwise; a bucket is listed at most once per BUCKET_PERIOD_NS, by ids only; a look that lists
-  the same although the folder changed is a check: numbers of folders are used again;
+  otherwise; a look that lists the same although the folder changed is a check: numbers of folders
+  are used again. In a bucket, at most once per BUCKET_PERIOD_NS, it lists the changes that programs
+  have announced, and looks at items of new ones. All ids are listed where no change was announced,
+  as in a bucket that earlier releases wrote, and once per BUCKET_CHECK_PERIOD_S;
 - a check: also reviews and clicks by other processes, files of an item that were exchanged or
   edited by hand (time, size, inode; in a bucket the entity tag), and items of a bucket that were
   deleted and written again, and those that could not be read at the last one. Each process checks
@@ -21,7 +23,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from itertools import islice
-from typing import Final, NamedTuple, TypeVar
+from typing import Final, TypeVar
 
 import structlog
 
@@ -47,7 +49,7 @@ logger = structlog.get_logger(__name__)
 T = TypeVar("T")
 # Stamps of a file system can be this coarse: another change may get the same stamp.
 SETTLED_NS: Final = 2_000_000_000
-# Listing a bucket takes one request per 1000 ids, checking it one per 1000 objects.
+# Listing changes or ids of a bucket takes one request per 1000, checking it one per 1000 objects.
 BUCKET_PERIOD_NS: Final = 5_000_000_000
 BUCKET_CHECK_PERIOD_S: Final = 600.0
 # Chosen: 10,000 items take 0.1 s of a processor.
@@ -59,17 +61,11 @@ BATCH: Final = 200
 # Whether rows were changed that do not fit each other yet.
 _IS_DIRTY: Final = """SELECT EXISTS (SELECT 1 FROM item WHERE is_dirty)
   OR EXISTS (SELECT 1 FROM grp WHERE is_stale)"""
+# A fingerprint as it is in a row; of many rows, names of its parts would take as long as the query.
+Known = tuple[int, str, str]
+_NONE: Final[Known] = (-1, "", "")
 Progress = Callable[[list[str], str, int], Iterable[str]]
 Write = Callable[[sqlite3.Connection], None]
-
-
-class _Listing(NamedTuple):
-    """Items as they were found: what was known of some before that, all names, and fingerprints."""
-
-    kind: Kind
-    before: Mapping[str, GroupFingerprint]
-    found: Mapping[str, int]
-    fingerprints: Mapping[str, GroupFingerprint]
 
 
 class CatalogIndex:
@@ -88,11 +84,14 @@ class CatalogIndex:
         self._guard = threading.RLock()
         # Of this connection: fingerprints of the rows and of omitted items, and when it looked; a
         # mark is forgotten where something is left to the next look.
-        self._known: dict[Kind, dict[str, GroupFingerprint]] = {kind: {} for kind in KINDS}
+        self._known: dict[Kind, dict[str, Known]] = {kind: {} for kind in KINDS}
         self._omitted: dict[Kind, dict[str, GroupFingerprint]] = {kind: {} for kind in KINDS}
+        self._stale: set[Kind] = set()
         self._is_checked: dict[Kind, bool] = dict.fromkeys(KINDS, False)
         self._marks: dict[Kind, int | None] = dict.fromkeys(KINDS, None)
         self._listed: dict[Kind, tuple[int, Mapping[str, int]]] = {kind: (0, {}) for kind in KINDS}
+        # Of a bucket.
+        self._looked_ns: int | None = None
         self._reported: set[tuple[Kind, str, str]] = set()
         self._data_version = 0
 
@@ -100,12 +99,16 @@ class CatalogIndex:
         """Items at the last look, without another one."""
         return len(self._known[kind])
 
-    def read(self, query: Callable[[sqlite3.Connection], T]) -> T:
-        """The result of a query, after a look at the store."""
+    def read(self, query: Callable[[sqlite3.Connection], T], kind: Kind | None = None) -> T:
+        """The result of a query, after a look at the store.
+
+        With a `kind` only at its items, for what others do not change.
+        """
 
         def look_and_read(connection: sqlite3.Connection) -> T:
-            for kind in KINDS:
-                self._look(connection, kind)
+            self._look(connection, KINDS if kind is None else (kind,))
+            if kind is not None:
+                return query(connection)
             with snapshot(connection):
                 (is_dirty,) = connection.execute(_IS_DIRTY).fetchone()
                 if not is_dirty:
@@ -119,22 +122,20 @@ class CatalogIndex:
 
     def check(self) -> None:
         """Compare all items with their rows; others may read meanwhile."""
-        known = self._run(lambda _: {kind: dict(self._known[kind]) for kind in KINDS})
         for kind in KINDS:
-            found = self._store.folder_numbers(kind=kind)
-            listing = _Listing(kind, known[kind], found, self._store.fingerprints(found, kind=kind))
-            self._run(partial(self._apply, listing=listing, again=True))
+            known = dict(self._run(partial(self._rows, kind=kind)))
+            current = self._store.fingerprints(self._store.folder_numbers(kind=kind), kind=kind)
+            self._run(partial(self._apply, kind=kind, before=known, current=current, again=True))
             self._is_checked[kind] = True
+        if not self._is_local:
+            self._run(partial(_note, names=("listed", "checked")))
 
     def reread(self, kind: Kind, item_id: str) -> None:
         """Take over remarks on an item that were changed just now."""
 
         def reread(connection: sqlite3.Connection) -> None:
-            before = self._known[kind].get(item_id)
-            if before is not None:
-                found = {item_id: before.folder}
-                current = self._store.fingerprints(found, kind=kind)
-                self._apply(connection, _Listing(kind, {item_id: before}, found, current))
+            if (before := self._rows(connection, kind).get(item_id)) is not None:
+                self._compare_some(connection, kind, {item_id: before[0]})
 
         self._run(reread)
 
@@ -160,101 +161,145 @@ class CatalogIndex:
         with self._guard:
             for is_last in (False, False, True):
                 try:
-                    connection = self._connection()
-                    result = work(connection)
+                    return work(self._connection())
                 except sqlite3.Error as error:
                     if is_last or not is_unusable(error):
                         raise
                     self._file.give_up(error)
-                else:
-                    return result
         raise AssertionError("unreachable")
 
     def _connection(self) -> sqlite3.Connection:
-        """A connection, with the fingerprints that are in its rows now."""
+        """A connection; `_rows` are read again if another one has written."""
         connection, is_new = self._file.connection()
         (version,) = connection.execute("PRAGMA data_version").fetchone()
         if is_new:
             self._is_checked = dict.fromkeys(KINDS, False)
-            self._marks = dict.fromkeys(KINDS, None)
+            self._marks, self._looked_ns = dict.fromkeys(KINDS, None), None
         if is_new or version != self._data_version:
-            for kind in KINDS:
-                rows = connection.execute(
-                    "SELECT id, folder, content, remarks FROM item WHERE kind = ?", (kind,)
-                )
-                known = {name: GroupFingerprint(*parts) for name, *parts in rows}
-                if self._known[kind].keys() - known.keys():
-                    # An erasure removes rows of items that stay.
-                    self._marks[kind] = None
-                self._known[kind] = known
+            self._stale.update(KINDS)
         self._data_version = version
         return connection
 
-    def _look(self, connection: sqlite3.Connection, kind: Kind) -> None:
+    def _rows(self, connection: sqlite3.Connection, kind: Kind) -> dict[str, Known]:
+        """The fingerprints that are in the rows of a kind now."""
+        if kind in self._stale:
+            text = "SELECT id, folder, content, remarks FROM item WHERE kind = ?"
+            rows = connection.execute(text, (kind,))
+            known: dict[str, Known] = {row[0]: row[1:] for row in rows}
+            if self._known[kind].keys() - known.keys():
+                # An erasure removes rows of items that stay.
+                self._marks[kind] = None
+            self._known[kind] = known
+            self._stale.remove(kind)
+        return self._known[kind]
+
+    def _look(self, connection: sqlite3.Connection, kinds: Iterable[Kind]) -> None:
         """Find what changed since the last look; see the module."""
-        # Before the listing: what changes meanwhile is found by the next look.
-        mark, last = self._mark(kind), self._marks[kind]
-        is_check = not self._is_checked[kind] and not self._was_checked(connection, kind)
-        is_current = last is not None and (
-            mark == last if self._is_local else mark - last < BUCKET_PERIOD_NS
-        )
-        if is_current and not is_check:
+        if not self._is_local:
+            self._look_at_bucket(connection)
             return
-        known, found = self._known[kind], self._store.folder_numbers(kind=kind)
-        wanted = {
-            name: number
-            for name, number in found.items()
-            if name not in known or known[name][0] != number
-        }
-        if self._is_local:
+        for kind in kinds:
+            # Before the listing: what changes meanwhile is found by the next look.
+            mark, known = self._mark(kind), self._rows(connection, kind)
+            is_check = not self._is_checked[kind]
+            if mark == self._marks[kind] and not is_check:
+                continue
+            found = self._store.folder_numbers(kind=kind)
             last_mark, last_found = self._listed[kind]
             is_odd = mark != last_mark and found == last_found
-            is_check = is_check or is_odd or len(known) <= ALWAYS_CHECKED
             self._listed[kind] = mark, found
-        if is_check:
-            wanted = found
+            is_check = is_check or is_odd or len(known) <= ALWAYS_CHECKED
+            is_done = self._compare(connection, kind, found, is_check=is_check)
+            is_settled = time.time_ns() - mark > SETTLED_NS
+            self._marks[kind] = mark if is_settled and is_done else None
+
+    def _compare(
+        self,
+        connection: sqlite3.Connection,
+        kind: Kind,
+        found: Mapping[str, int],
+        *,
+        is_check: bool,
+    ) -> bool:
+        """Bring rows up to date with the ids that were found; returns as `_apply`."""
+        known, wanted = self._rows(connection, kind), found
+        if not is_check:
+            before = known.get
+            wanted = {n: number for n, number in found.items() if before(n, _NONE)[0] != number}
         current = self._store.fingerprints(wanted, kind=kind)
-        names = known.keys() if is_check else (known.keys() - found.keys()) | wanted.keys()
-        before = {name: known[name] for name in names if name in known}
-        is_done = self._apply(connection, _Listing(kind, before, found, current), again=is_check)
-        if is_check:
-            self._is_checked[kind] = True
-            if not self._is_local:
-                fact = (kind, int(time.time()))
-                connection.execute("INSERT OR REPLACE INTO fact VALUES (?, ?)", fact)
-        is_settled = time.time_ns() - mark > SETTLED_NS if self._is_local else bool(found)
-        self._marks[kind] = mark if is_settled and is_done else None
+        is_done = True
+        if not is_check or current != known:
+            names = set(wanted)
+            # Otherwise all that are known were found.
+            if len(found) - len(names - known.keys()) < len(known):
+                names |= known.keys() - found.keys()
+            compared = {name: known[name] for name in names if name in known}
+            is_done = self._apply(connection, kind, compared, current, again=is_check)
+        self._is_checked[kind] |= is_check
+        return is_done
+
+    def _compare_some(
+        self, connection: sqlite3.Connection, kind: Kind, numbers: Mapping[str, int]
+    ) -> None:
+        known, current = self._rows(connection, kind), self._store.fingerprints(numbers, kind=kind)
+        before = {name: known[name] for name in numbers if name in known}
+        self._apply(connection, kind, before, current)
 
     def _mark(self, kind: Kind) -> int:
-        """Stamp of the folder of a kind, 0 without it; of a bucket the time."""
-        if not self._is_local:
-            return time.monotonic_ns()
+        """Stamp of the folder of a kind, 0 without it."""
         with disk_errors(f"list {kind}s"):
             try:
                 return (self._store.root / f"{kind}s").stat().st_mtime_ns
             except FileNotFoundError:
                 return 0
 
-    def _was_checked(self, connection: sqlite3.Connection, kind: Kind) -> bool:
-        """Whether another process has checked the bucket a short time ago."""
-        if self._is_local:
-            return False
-        row = connection.execute("SELECT value FROM fact WHERE name = ?", (kind,)).fetchone()
-        # A clock that went back makes the time of the check one of the future.
-        return row is not None and 0 <= time.time() - row[0] < BUCKET_CHECK_PERIOD_S
+    def _look_at_bucket(self, connection: sqlite3.Connection) -> None:
+        now_ns = time.monotonic_ns()
+        if self._looked_ns is not None and now_ns - self._looked_ns < BUCKET_PERIOD_NS:
+            return
+        # Before anything is listed: what is announced meanwhile is left to the next look.
+        changes, is_empty = self._store.changes(), False
+        last_s = dict(connection.execute("SELECT name, value FROM fact"))
+        is_check = not all(self._is_checked.values()) and not _is_recent(last_s.get("checked"))
+        if is_check or not changes or not _is_recent(last_s.get("listed")):
+            numbers = {kind: self._store.folder_numbers(kind=kind) for kind in KINDS}
+            for kind, found in numbers.items():
+                self._compare(connection, kind, found, is_check=is_check)
+            _note(connection, ("listed", "checked") if is_check else ("listed",))
+            connection.execute("DELETE FROM announced")
+            is_empty = not any(numbers.values())
+        else:
+            seen = {name for (name,) in connection.execute("SELECT name FROM announced")}
+            changes = {name: changes[name] for name in changes.keys() - seen}
+            for kind in KINDS:
+                if some := {item_id: 0 for what, item_id in changes.values() if what == kind}:
+                    self._compare_some(connection, kind, some)
+        # Items that could not be read are left to the next look of any process.
+        done = [
+            (n,) for n, (kind, item_id) in changes.items() if item_id not in self._omitted[kind]
+        ]
+        if done:
+            with transaction(connection):
+                connection.executemany("INSERT OR IGNORE INTO announced VALUES (?)", done)
+        self._looked_ns = None if is_empty else now_ns
 
     def _apply(
-        self, connection: sqlite3.Connection, listing: "_Listing", *, again: bool = False
+        self,
+        connection: sqlite3.Connection,
+        kind: Kind,
+        before: Mapping[str, Known],
+        current: Mapping[str, GroupFingerprint],
+        *,
+        again: bool = False,
     ) -> bool:
-        """Bring the rows of items up to date; they are linked before the next query.
+        """Bring rows that were as `before` up to date; they are linked before the next query.
 
         `again` also tries those that could not be read at the last check. Returns whether nothing
         is left to the next look.
         """
-        kind, before, found, current = listing
-        omitted = {} if again else self._omitted[kind]
-        known = self._known[kind]
-        self._omitted[kind] = {name: one for name, one in omitted.items() if name in found}
+        if again:
+            self._omitted[kind].clear()
+        known, omitted = self._rows(connection, kind), self._omitted[kind]
         # What another thread or process has changed since is left to the next look.
         gone = [
             name for name, one in before.items() if name not in current and known.get(name) == one
@@ -274,9 +319,8 @@ class CatalogIndex:
             is_done &= self._write(connection, kind, {n: current[n] for n in writes}, writes)
         if gone:
             with transaction(connection):
-                connection.executemany(
-                    "DELETE FROM item WHERE kind = ? AND id = ?", [(kind, name) for name in gone]
-                )
+                text = "DELETE FROM item WHERE kind = ? AND id = ?"
+                connection.executemany(text, [(kind, name) for name in gone])
             for name in gone:
                 known.pop(name, None)
         return is_done
@@ -326,3 +370,14 @@ class CatalogIndex:
 
 def _no_row(_: sqlite3.Connection) -> None:
     """Stands for an item that has no row."""
+
+
+def _note(connection: sqlite3.Connection, names: Iterable[str]) -> None:
+    """Keep that a bucket was listed or checked just now."""
+    facts = [(name, int(time.time())) for name in names]
+    connection.executemany("INSERT OR REPLACE INTO fact VALUES (?, ?)", facts)
+
+
+def _is_recent(time_s: int | None) -> bool:
+    # A clock that went back makes the time one of the future.
+    return time_s is not None and 0 <= time.time() - time_s < BUCKET_CHECK_PERIOD_S

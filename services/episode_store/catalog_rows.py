@@ -9,15 +9,8 @@ from typing import Any, Final
 import numpy as np
 import structlog
 
-from dextouch import schemas
-from dextouch.episodes import (
-    EpisodeReader,
-    EpisodeStore,
-    GroupFingerprint,
-    Kind,
-    RecordingReader,
-    has_object_poses,
-)
+from dextouch import episodes, schemas
+from dextouch.episodes import EpisodeReader, EpisodeStore, GroupFingerprint, Kind, RecordingReader
 from dextouch.errors import CorruptDataError
 from services.episode_store.filters import (
     EQUALITY_FILTERS,
@@ -108,7 +101,10 @@ def read_row(
     at = at and within_calendar(at)
     item = item_of(reader, summary)
     is_clickable = isinstance(reader, EpisodeReader) and _is_clickable(reader)
-    review, clicks = read_remarks(store, kind, item_id)
+    review, clicks = None, None
+    # Without its stamp there is none.
+    if fingerprint.remarks.strip():
+        review, clicks = read_remarks(store, kind, item_id)
     parts = (item_id, about.task, about.instruction, about.operator, about.station, about.trace_id)
     names = ("kind", "id", *EQUALITY_FILTERS, "complete", "duration_s")
     columns: dict[str, object] = {name: getattr(item, name) for name in names}
@@ -188,7 +184,8 @@ def _is_clickable(reader: EpisodeReader) -> bool:
     about = reader.attributes
     if about.origin != "recorded" or about.success is None or about.recovered:
         return False
-    return reader.num_steps > 0 and "camera_head" in reader.streams and not has_object_poses(reader)
+    has_images = reader.num_steps > 0 and "camera_head" in reader.streams
+    return has_images and not episodes.has_object_poses(reader)
 
 
 def _shared_fields(reader: EpisodeReader | RecordingReader) -> dict[str, Any]:
@@ -208,14 +205,9 @@ def write_row(connection: sqlite3.Connection, row: ItemRow) -> None:
     """Put an item in the place of an earlier one of its name; `relink` must follow."""
     execute = connection.execute
     execute("DELETE FROM item WHERE kind = :kind AND id = :id", row.item)
-    execute(
-        "INSERT OR IGNORE INTO grp (task, domain, origin, kind) "
-        "VALUES (:task, :domain, :origin, :kind)",
-        row.item,
-    )
     (group,) = execute(
-        "SELECT number FROM grp WHERE (task, domain, origin, kind) = "
-        "(:task, :domain, :origin, :kind)",
+        "INSERT INTO grp (task, domain, origin, kind) VALUES (:task, :domain, :origin, :kind) "
+        "ON CONFLICT DO UPDATE SET kind = kind RETURNING number",
         row.item,
     ).fetchone()
     number = _insert(connection, "item", {**row.item, "grp": group})

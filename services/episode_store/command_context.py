@@ -73,3 +73,12 @@ class Context:
                 "it to a folder first, or use the versions of the bucket"
             )
         return self.root
+
+
+def table(rows: list[tuple[str, ...]]) -> list[str]:
+    """Format rows of text as lines with aligned columns."""
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))] if rows else []
+    return [
+        "  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip()
+        for row in rows
+    ]

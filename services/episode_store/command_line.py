@@ -1,7 +1,8 @@
 """Command line `dextouch store`: inspect, repair and delete items of a store."""
 
+import gc
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
@@ -12,35 +13,20 @@ import numpy as np
 from dextouch.command_line import progress, say, write_result
 from dextouch.episodes import (
     KINDS,
-    ClickedPoses,
-    EpisodeGrid,
-    EpisodeReader,
     EpisodeStore,
     GroupFiles,
     Kind,
     LocalGroup,
     TrashKind,
-    clicked_poses,
-    has_object_poses,
     maintenance,
     shard_path,
     stream_arrays,
-    touched_objects,
 )
 from dextouch.errors import InvalidInputError, NotFoundError
-from dextouch.geometry import transform_from_pose
-from dextouch.schemas import (
-    EpisodeAttributes,
-    EpisodeClicks,
-    ObjectClicks,
-    RecordingAttributes,
-    SceneObject,
-    SceneObjects,
-    json_ready,
-)
-from dextouch.serving import configure_logging, load_settings
+from dextouch.schemas import EpisodeAttributes, RecordingAttributes, json_ready
+from dextouch.serving import configure_logging
 from services.episode_store.catalog import Catalog, ListedRow
-from services.episode_store.command_context import Context, Outcome
+from services.episode_store.command_context import Context, Outcome, table
 from services.episode_store.filters import EpisodeFilter
 from services.episode_store.parser import store_parser
 
@@ -50,11 +36,7 @@ _OUTCOMES = {True: "success", False: "failure", None: "not judged"}
 
 
 def main(argv: Sequence[str]) -> int:
-    """Run a command of the store's command line.
-
-    Returns:
-        0; 1 if something is damaged, remains or is not provably deleted.
-    """
+    """Run a command; returns 1 if something is damaged, remains or is not provably deleted."""
     options = store_parser().parse_args(list(argv))
     # Items that the catalog leaves out are reported on stderr.
     configure_logging(service="episode_store", log_format="auto", level="warning")
@@ -65,8 +47,9 @@ def main(argv: Sequence[str]) -> int:
     return status
 
 
-# Imported where they are needed: `list` should not wait for FastAPI and all that edits items.
+# Imported where they are needed: `list` should not wait for settings and all that edits items.
 def _configured_url() -> str:
+    from dextouch.serving import load_settings
     from services.episode_store.settings import EpisodeStoreSettings
 
     return load_settings(EpisodeStoreSettings, []).store_url
@@ -88,18 +71,11 @@ def readable_size(num_bytes: int) -> str:
     return f"{num_bytes} bytes" if unit == 0 else f"{size:.3g} {_SIZES[unit]}"
 
 
-def table(rows: list[tuple[str, ...]]) -> list[str]:
-    """Format rows of text as lines with aligned columns."""
-    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))] if rows else []
-    return [
-        "  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip()
-        for row in rows
-    ]
-
-
 def list_items(context: Context) -> Outcome:
     """List matching items of the store, or its trash."""
     options = context.options
+    # Collections among many rows would search all that was imported.
+    gc.freeze()
     if options.trash:
         return _list_trash(context)
     root = context.root
@@ -236,7 +212,7 @@ def verify(context: Context) -> Outcome:
     return result, EXIT_DAMAGED if damaged else 0
 
 
-def _say_report(report: maintenance.ItemReport) -> None:
+def _say_report(report: "maintenance.ItemReport") -> None:
     size = f"{report.num_arrays} arrays, {report.num_bytes} bytes"
     if report.damaged:
         for finding in report.findings:
@@ -246,74 +222,6 @@ def _say_report(report: maintenance.ItemReport) -> None:
     else:
         state = "being written" if report.busy else "unfinished"
         say(f"{report.item_id}  {state}  {report.kind}, {size}")
-
-
-def clicks(context: Context) -> Outcome:
-    """Check the clicks of a file and of the store, and list the places that they and touch give.
-
-    The result is a file of all clicks.
-    """
-    given = ObjectClicks.load(context.options.clicks)
-    names = sorted({*given.episodes, *context.store.list()})
-    found = {name: given.episodes.get(name) or context.store.clicks(name) for name in names}
-    rows: list[tuple[str, ...]] = [("episode", "object", "from", "x mm", "y mm", "heading", "± mm")]
-    for name, one in found.items():
-        reader = context.store.open(name)
-        clicked = None
-        if one is not None:
-            is_lenient = name not in given.episodes
-            clicked = clicked_poses(reader.attributes, given, one, may_lack_headings=is_lenient)
-            rows += _clicked_rows(name, one, clicked)
-        rows += _touched_rows(reader, given, clicked)
-    for line in table(rows):
-        say(line)
-    episodes = {name: one for name, one in found.items() if one is not None}
-    return json_ready(given.model_copy(update={"episodes": episodes})), 0
-
-
-def _clicked_rows(
-    name: str, clicked: EpisodeClicks, found: ClickedPoses
-) -> Iterator[tuple[str, ...]]:
-    for index, one in enumerate(found.objects):
-        click = clicked.objects.get(one.name)
-        if click is None:
-            if one.touch is None:
-                yield name, one.name, "", "not clicked", *[""] * 3
-        elif click.state != "seen":
-            yield name, one.name, "clicks", click.state, *[""] * 3
-        elif not found.known[index]:
-            yield name, one.name, "clicks", "no heading", *[""] * 3
-        else:
-            place = _place(one, found.poses[index], found.sd_m[index])
-            yield name, one.name, "clicks", *place
-
-
-def _touched_rows(
-    reader: EpisodeReader, objects: SceneObjects, clicked: ClickedPoses | None
-) -> Iterator[tuple[str, ...]]:
-    """Places that touch alone gives, of objects that neither clicks nor streams place."""
-    about = reader.attributes
-    listed = objects.tasks.get(about.task, ())
-    names = tuple(one.name for one in listed)
-    is_touched = about.success and any(one.touch is not None for one in listed)
-    if not is_touched or has_object_poses(reader) or about.object_names not in {(), names}:
-        return
-    done = np.zeros(len(listed), dtype=np.bool_) if clicked is None else clicked.known
-    track = touched_objects(EpisodeGrid(reader), objects)
-    for index, one in enumerate(listed):
-        if one.touch is not None and not done[index]:
-            place = ("no clear hold", *[""] * 3)
-            if track.known[0, index]:
-                place = _place(one, track.poses[0, index], track.sd_m[index])
-            yield about.episode_id, one.name, "touch", *place
-
-
-def _place(one: SceneObject, pose: np.ndarray, sd_m: float) -> tuple[str, str, str, str]:
-    """Place (x, y mm), heading and error (mm) of an object at the first step, as text."""
-    axis = one.click.heading
-    x, y = transform_from_pose(pose)[:2, "xyz".index(axis[-1])] * (-1 if axis[0] == "-" else 1)
-    heading = "symmetric" if one.click.symmetric else f"{np.rad2deg(np.arctan2(y, x)):.0f}°"
-    return f"{1e3 * pose[0]:.0f}", f"{1e3 * pose[1]:.0f}", heading, f"{1e3 * sd_m:.1f}"
 
 
 def delete(context: Context) -> Outcome:
@@ -475,7 +383,6 @@ _COMMANDS: dict[str, Callable[[Context], Outcome]] = {
     "list": list_items,
     "show": show,
     "verify": verify,
-    "clicks": clicks,
     "delete": delete,
     "deletions": deletions,
     "restore": restore,

@@ -63,10 +63,8 @@ def commit_spool(
 ) -> dict[str, int]:
     """Copy a closed spool to a new recording; returns the number of samples by stream.
 
-    Raises:
-        ConflictError: the recording exists, or the spool has other samples than announced.
-        CorruptDataError: the spool is damaged; nothing is written.
-        StorageFullError: no space; nothing is written, the spool is kept.
+    Raises ConflictError if the recording exists or the spool has other samples than announced,
+    CorruptDataError if it is damaged, StorageFullError without space; nothing is written then.
     """
     reader = SpoolReader(spool)
     with store.writer(kind="recording", attributes=attributes) as writer:

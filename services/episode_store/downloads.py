@@ -107,11 +107,9 @@ class Downloads:
     def begin(self, wanted: DownloadItems) -> StreamedResponse:
         """Open the items and begin; nothing is exported yet.
 
-        Raises:
-            NotFoundError: an item is not in the store, or all of them were rejected.
-            LimitExceededError: too many items or bytes, or downloads at the same time.
-            UnavailableError: the packages of the extra `export` are missing.
-            StorageError: an item is damaged, or the disk of the store is full.
+        Raises NotFoundError if an item is missing or all were rejected, LimitExceededError for too
+        many items, bytes or downloads at once, UnavailableError without the extra `export`, and
+        StorageError if an item is damaged or the disk is full.
         """
         absent = [name for name in _PACKAGES if find_spec(name) is None]
         if absent:

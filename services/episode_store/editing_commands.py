@@ -1,16 +1,20 @@
-"""Commands of `dextouch store` that edit or copy items: trim, relabel, merge, backups, notes."""
+"""Commands of `dextouch store` that edit, copy or annotate items: trim, merge, notes, clicks."""
 
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import asdict
 from typing import Any
 
+import numpy as np
 from pydantic import ValidationError
 
+from dextouch import episodes, schemas
 from dextouch.command_line import say
-from dextouch.episodes import EpisodeStore, Kind, editing
+from dextouch.episodes import EpisodeReader, EpisodeStore, Kind, editing
 from dextouch.errors import DexTouchError, InvalidInputError, NotFoundError
-from dextouch.schemas import EditedItem, NewNote, TimedNote, first_problems, json_ready
-from services.episode_store.command_context import Context, Outcome
+from dextouch.geometry import transform_from_pose
+from dextouch.schemas import EditedItem, NewNote, first_problems, json_ready
+from services.episode_store.command_context import Context, Outcome, table
 
 EXIT_REFUSED = 1
 
@@ -179,10 +183,76 @@ def note(context: Context) -> Outcome:
         editing.remove_note(store, options.id, options.remove, kind=kind)
     notes = store.notes(options.id, kind=kind).notes
     for one in notes:
-        say(_note_line(one, zero))
+        span = f"{(one.start_ns - zero) / 1e9:.3f} … {(one.stop_ns - zero) / 1e9:.3f} s"
+        say(f"{one.number}  {span}  {one.author or '-'}  {one.text}")
     return {"notes": [json_ready(one) for one in notes]}, 0
 
 
-def _note_line(one: TimedNote, zero: int) -> str:
-    span = f"{(one.start_ns - zero) / 1e9:.3f} … {(one.stop_ns - zero) / 1e9:.3f} s"
-    return f"{one.number}  {span}  {one.author or '-'}  {one.text}"
+def clicks(context: Context) -> Outcome:
+    """Check the clicks of a file and of the store, and list the places that they and touch give.
+
+    The result is a file of all clicks.
+    """
+    given = schemas.ObjectClicks.load(context.options.clicks)
+    names = sorted({*given.episodes, *context.store.list()})
+    found = {name: given.episodes.get(name) or context.store.clicks(name) for name in names}
+    rows: list[tuple[str, ...]] = [("episode", "object", "from", "x mm", "y mm", "heading", "± mm")]
+    for name, one in found.items():
+        reader = context.store.open(name)
+        clicked = None
+        if one is not None:
+            is_lenient = name not in given.episodes
+            clicked = episodes.clicked_poses(
+                reader.attributes, given, one, may_lack_headings=is_lenient
+            )
+            rows += _clicked_rows(name, one, clicked)
+        rows += _touched_rows(reader, given, clicked)
+    for line in table(rows):
+        say(line)
+    kept = {name: one for name, one in found.items() if one is not None}
+    return json_ready(given.model_copy(update={"episodes": kept})), 0
+
+
+def _clicked_rows(
+    name: str, clicked: schemas.EpisodeClicks, found: episodes.ClickedPoses
+) -> Iterator[tuple[str, ...]]:
+    for index, one in enumerate(found.objects):
+        click = clicked.objects.get(one.name)
+        if click is None:
+            if one.touch is None:
+                yield name, one.name, "", "not clicked", *[""] * 3
+        elif click.state != "seen":
+            yield name, one.name, "clicks", click.state, *[""] * 3
+        elif not found.known[index]:
+            yield name, one.name, "clicks", "no heading", *[""] * 3
+        else:
+            place = _place(one, found.poses[index], found.sd_m[index])
+            yield name, one.name, "clicks", *place
+
+
+def _touched_rows(
+    reader: EpisodeReader, objects: schemas.SceneObjects, clicked: episodes.ClickedPoses | None
+) -> Iterator[tuple[str, ...]]:
+    """Places that touch alone gives, of objects that neither clicks nor streams place."""
+    about = reader.attributes
+    listed = objects.tasks.get(about.task, ())
+    names = tuple(one.name for one in listed)
+    is_touched = about.success and any(one.touch is not None for one in listed)
+    if not is_touched or episodes.has_object_poses(reader) or about.object_names not in {(), names}:
+        return
+    done = np.zeros(len(listed), dtype=np.bool_) if clicked is None else clicked.known
+    track = episodes.touched_objects(episodes.EpisodeGrid(reader), objects)
+    for index, one in enumerate(listed):
+        if one.touch is not None and not done[index]:
+            place = ("no clear hold", *[""] * 3)
+            if track.known[0, index]:
+                place = _place(one, track.poses[0, index], track.sd_m[index])
+            yield about.episode_id, one.name, "touch", *place
+
+
+def _place(one: schemas.SceneObject, pose: np.ndarray, sd_m: float) -> tuple[str, str, str, str]:
+    """Place (x, y mm), heading and error (mm) of an object at the first step, as text."""
+    axis = one.click.heading
+    x, y = transform_from_pose(pose)[:2, "xyz".index(axis[-1])] * (-1 if axis[0] == "-" else 1)
+    heading = "symmetric" if one.click.symmetric else f"{np.rad2deg(np.arctan2(y, x)):.0f}°"
+    return f"{1e3 * pose[0]:.0f}", f"{1e3 * pose[1]:.0f}", heading, f"{1e3 * sd_m:.1f}"

@@ -35,6 +35,11 @@ SORT_COLUMNS: Final = {
 }  # fmt: skip
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _FIGURE = "SELECT value FROM figure WHERE number = (SELECT number FROM figure_name WHERE name = ?)"
+_WITH_TEXT: Final = "SELECT row FROM item WHERE instr(text, ?) > 0"
+# The text of a take is that of its recording and of its episode.
+_TAKES_WITH_TEXT: Final = """WITH m AS MATERIALIZED (
+  SELECT row FROM item WHERE instr(text, ?) > 0)
+  SELECT row FROM m UNION ALL SELECT t.row FROM m CROSS JOIN item t ON t.aligned = m.row"""
 EARLIEST, LATEST = datetime(1, 1, 1, tzinfo=UTC), datetime(9999, 12, 31, tzinfo=UTC)
 _SUCCESS: dict[Outcome, bool | None] = {"success": True, "failure": False, "not_judged": None}
 
@@ -43,20 +48,15 @@ _SUCCESS: dict[Outcome, bool | None] = {"success": True, "failure": False, "not_
 class Condition:
     """An SQL condition on a row `i` of the catalog with its parameters.
 
-    In the list of takes (`of_takes`) a recording's last episode is the row `a`. With `is_counted`
-    its terms have only columns of `tally`; few rows match one that `is_rare`.
+    In the list of takes (`of_takes`) a recording's last episode is the row `i.aligned`. With
+    `is_counted` its terms have only columns of `tally`; few rows match one that `is_rare`.
     """
 
     of_takes: bool = False
     is_counted: bool = True
     is_rare: bool = False
-    tables: str = "item i"
     terms: list[str] = field(default_factory=list)
     values: list[object] = field(default_factory=list)
-
-    def join_episode(self) -> None:
-        """Make the last episode of a take known to the terms."""
-        self.tables = "item i LEFT JOIN item a ON a.row = i.aligned"
 
     def add(self, term: str, *values: object, is_counted: bool = False) -> None:
         """A further term that must hold."""
@@ -116,19 +116,14 @@ class CatalogFilter(FrozenModel):
         if self.outcome is not None:
             to.add("i.success IS ?", _SUCCESS[self.outcome], is_counted=True)
         if self.text:
-            # `text` of a take is that of its recording and of its episode.
-            column = "i.text"
-            if to.of_takes:
-                to.join_episode()
-                column = "i.text || coalesce(char(10) || a.text, '')"
-            to.add(f"instr({column}, ?) > 0", self.text.casefold())
+            found = _TAKES_WITH_TEXT if to.of_takes else _WITH_TEXT
+            to.add(f"i.row IN ({found})", self.text.casefold())
             to.is_rare = True
         for name, least in map(quality_bound, self.min_quality):
             if least > -math.inf:
                 figure = f"({_FIGURE} AND row = i.row)"
                 if to.of_takes:
-                    to.join_episode()
-                    figure = f"coalesce(({_FIGURE} AND row = a.row), {figure})"
+                    figure = f"coalesce(({_FIGURE} AND row = i.aligned), {figure})"
                 to.add(f"{figure} >= ?", *[name] * (1 + to.of_takes), least)
         if self.created_after is not None or self.created_before is not None:
             after, before = self.created_after or EARLIEST, self.created_before or LATEST

@@ -101,11 +101,8 @@ class Ingest:
     def create(self, attributes: RecordingAttributes, sender: Sender = ANYONE) -> RecordingStatus:
         """Begin an upload, or return the status of an existing one.
 
-        Raises:
-            InvalidInputError: a recording without a stream.
-            AccessDeniedError: the sender's key is bound to another station.
-            ConflictError: the id is taken by another recording, or by an upload of another key, or
-                this one was deleted.
+        Raises InvalidInputError without a stream, AccessDeniedError for a key of another station,
+        and ConflictError if the id is taken, also by an upload of another key, or was deleted.
         """
         recording_id = attributes.recording_id
         sender.check_station(attributes.station)
@@ -163,14 +160,11 @@ class Ingest:
     ) -> BatchReceipt:
         """Store a batch; it is durable when this returns.
 
-        Raises:
-            NotFoundError: no such recording.
-            AccessDeniedError: it is none of the sender.
-            UnknownNameError: no such stream.
-            ConflictError: a gap, other samples under a known number, or a finished recording.
-            PacketError, InvalidInputError: not a valid batch of this stream.
-            UnavailableError: the recording is being finished; try again later.
-            StorageFullError: no space; acknowledged batches are kept.
+        Raises NotFoundError or UnknownNameError without the recording or stream, AccessDeniedError
+        if it is none of the sender, ConflictError for a gap, other samples under a known number or
+        a finished recording, PacketError or InvalidInputError if it is no batch of this stream,
+        UnavailableError while the recording is being finished, and StorageFullError without space;
+        acknowledged batches are kept.
         """
         with self._working_on(recording_id):
             spool = self._upload(recording_id, sender)
@@ -182,14 +176,11 @@ class Ingest:
     ) -> RecordingStatus:
         """Commit a complete upload; idempotent.
 
-        Raises:
-            NotFoundError: no such recording.
-            AccessDeniedError: it is none of the sender.
-            ConflictError: batches are missing, more are here than announced, or the samples are
-                not those announced; also where the recording is finished already.
-            InvalidInputError: not all streams are announced, or none has a sample.
-            UnavailableError: it is being finished already; try again later.
-            StorageFullError: no space; the upload is unchanged.
+        Raises NotFoundError without it, AccessDeniedError if it is none of the sender,
+        ConflictError if other batches or samples are here than announced, also once it is
+        finished, InvalidInputError if not all streams are announced or none has a sample,
+        UnavailableError while it is being finished, and StorageFullError without space; the upload
+        is unchanged then.
         """
         with self._working_on(recording_id):
             is_finished = self.is_finished(recording_id)

@@ -241,9 +241,8 @@ class Enrolments:
     def exchange(self, text: str, *, client: str) -> StationKey:
         """Exchange a token for a key, once; `client` is the address of the station.
 
-        Raises:
-            AccessDeniedError: an unknown, used or expired token.
-            StorageError: the key cannot be stored; the token stays valid.
+        Raises AccessDeniedError for an unknown, used or expired token, StorageError if the key
+        cannot be stored; the token stays valid then.
         """
         with self._lock:
             token = self._valid(secret_digest(text))

@@ -222,11 +222,8 @@ def robot_hands(reader: EpisodeReader, query: RobotHandsQuery) -> bytes:
     Arrays: `t_ns` [n]; for each side `SIDE_points_world_m` [n, 5, 4, 3], knuckle, PIP, DIP and tip
     from thumb to little finger; `T_world_wrist_left`, `T_world_wrist_right` and
     `T_world_camera_head` [n, 4, 4].
-
-    Raises:
-        UnknownNameError: the episode has no such actions.
-        InvalidInputError: actions that are not of the robot hand.
-        LimitExceededError: too many steps.
+    Raises UnknownNameError without such actions, InvalidInputError for those of another hand, and
+    LimitExceededError for too many steps.
     """
     stream = STREAMS[query.action_kind]
     count = reader.count(stream, query.start_ns, query.stop_ns)
@@ -444,10 +441,8 @@ def _in_colour(picture: np.ndarray) -> np.ndarray:
 def reduce_signals(reader: Reader, query: SignalsQuery) -> bytes:
     """Lowest and highest values of every signal, float32 [points] as msgpack; NaN without samples.
 
-    Raises:
-        UnknownNameError: no such stream.
-        InvalidInputError: no such value, an image stream, or an empty span.
-        LimitExceededError: too many signals or samples.
+    Raises UnknownNameError without the stream, InvalidInputError without the value, for images or
+    an empty span, and LimitExceededError for too many signals or samples.
     """
     names = list(dict.fromkeys(query.names.split(",")))
     text = f"signals: got {len(names)}, expected at most {MAX_SIGNALS}"

@@ -6,13 +6,14 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from dextouch.command_line import ProgressLines, write_result
+from dextouch.command_line import ProgressLines, progress, write_result
 from dextouch.serving import load_settings
 from dextouch.worlds import World, serve_worlds
 from services.networks.weight_files import digest_of
 from services.world_model import checkpoints
 from services.world_model.network.model import Sampling
 from services.world_model.paper_settings import (
+    CacheCommand,
     DistillCommand,
     TrainSettings,
     adapt_settings,
@@ -27,6 +28,7 @@ from services.world_model.settings import (
 )
 from services.world_model.training.distribution import joined_processes
 from services.world_model.training.joint_trainer import TrainingProgress, TrainingReport, train
+from services.world_model.training.latent_cache import fill_latent_cache
 from services.world_model.world import open_world
 
 if TYPE_CHECKING:
@@ -60,6 +62,18 @@ def run_distill(arguments: list[str]) -> int:
     settings = load_settings(DistillCommand, arguments)
     network = checkpoints.read_checkpoint(settings.init).metadata.network
     return _train(settings.training(network), settings.json_path)
+
+
+def run_cache(arguments: list[str]) -> int:
+    """Encode the images of a training, and print how many windows there are."""
+    settings = load_settings(CacheCommand, arguments)
+    filled = fill_latent_cache(settings, lambda some: progress(some, "latents", len(some)))
+    print(
+        f"{filled.path}: {filled.num_windows} windows of {filled.num_episodes} episodes, "
+        f"{filled.num_instructions} instructions"
+    )
+    write_result(settings.json_path, {**asdict(filled), "path": str(filled.path)})
+    return 0
 
 
 def _train(settings: TrainSettings, json_path: Path | None) -> int:

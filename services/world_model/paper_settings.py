@@ -182,6 +182,9 @@ class TrainSettings(RunSettings):
     self_forcing: CliImplicitFlag[bool] = Field(
         default=False, description="train on own contexts and samples (see dextouch train distill)"
     )
+    consistency: CliImplicitFlag[bool] = Field(
+        default=False, description="train on own ends of paths (see dextouch train distill)"
+    )
     network: NetworkConfig = Field(default=NetworkConfig(), description="shape of the network")
 
     def with_adapters(self) -> "TrainSettings":
@@ -324,6 +327,21 @@ class TrainCommand(CommandSettings, TrainSettings):
         return (*given, PresetSource(settings_cls))
 
 
+class CacheCommand(TrainCommand):
+    """Encode the images of a training once, before it, so that it never runs the video encoder.
+
+    Give it the flags of that training, which then reads the same file. What is there already is
+    not computed again, so that it can be interrupted, and new episodes can be added. A training
+    keeps what it does not find there, too.
+
+    Example:
+      dextouch train cache --preset wan22-5b --wan.folder models/Wan2.2-TI2V-5B-Diffusers \
+        --episodes runs/episodes --wan.latent-cache runs/latents.sqlite3 --wan.text-cache runs/texts
+    """
+
+    model_config = service_config("world_model_cache", "dextouch train cache")
+
+
 class AdaptCommand(CommandSettings, AdaptationSettings, FromCheckpointSettings):
     """Adapt a world model of the paper's form to new tasks, from robot and human episodes.
 
@@ -341,9 +359,11 @@ class AdaptCommand(CommandSettings, AdaptationSettings, FromCheckpointSettings):
 
 
 class DistillCommand(CommandSettings, FromCheckpointSettings):
-    """Train a world model in the paper's form to sample in few steps, by self-forcing.
+    """Train a world model in the paper's form to sample in few steps.
 
-    The network, its codecs and its normalizers are those of the checkpoint.
+    By self-forcing it predicts the mean of what may follow: right where commands decide it. By
+    consistency it predicts one of them, and another one from other noise. The network, its codecs
+    and its normalizers are those of the checkpoint.
 
     Example:
       dextouch train distill --init runs/paper.safetensors --steps 1 --episodes runs/episodes
@@ -352,6 +372,9 @@ class DistillCommand(CommandSettings, FromCheckpointSettings):
     model_config = service_config("world_model_distill", "dextouch train distill")
 
     steps: int = Field(default=1, ge=1, le=64, description="network calls per chunk")
+    objective: Literal["self_forcing", "consistency"] = Field(
+        default="self_forcing", description="what is learned: the mean future, or one"
+    )
     output: Output = Path("runs/world_model/distilled.safetensors")
     name: str = Field(default="distilled", description="model name in the checkpoint")
     json_path: Path | None = Field(default=None, alias="json", description=JSON_HELP)
@@ -359,7 +382,8 @@ class DistillCommand(CommandSettings, FromCheckpointSettings):
     def training(self, network: NetworkConfig) -> TrainSettings:
         """The same run as training of a network from its checkpoint."""
         few = network.model_copy(update={"sampling_steps": self.steps, "sampler": "euler"})
-        return super().training(few).model_copy(update={"self_forcing": True})
+        flags = {"self_forcing": True, "consistency": self.objective == "consistency"}
+        return super().training(few).model_copy(update=flags)
 
 
 class TrainTokenizerCommand(CommandSettings, TrainTokenizerSettings):

@@ -307,7 +307,7 @@ def _training_plan(settings: TrainSettings, num_processes: int, depth: int) -> T
             outer=weights - whole - layers,
             layer=memory_of(model.joint_layers()[0].state_dict()),
             step=_step_bytes(model, windows, min(settings.accumulate, 2), is_sharded=shards > 1),
-            encoding=windows * _encoding_bytes(_of_codec(config)),
+            encoding=_encoding_bytes(_of_codec(config), windows),
             copies=2 + (settings.optimizer.ema_decay > 0.0),
             shards=shards,
         )
@@ -323,12 +323,12 @@ def _of_codec(config: NetworkConfig) -> NetworkConfig:
 
 
 @cache
-def _encoding_bytes(config: NetworkConfig) -> int:
-    """What the codec takes for the latents of one window."""
+def _encoding_bytes(config: NetworkConfig, num_windows: int) -> int:
+    """What the codec takes for the latents of some windows."""
     with torch.device("meta"), torch.no_grad():
         codec = JointWorldModel(config).codec
         shape = config.max_steps, config.image_px, config.image_px, 3
-        images = torch.zeros(config.num_views, *shape)
+        images = torch.zeros(num_windows * config.num_views, *shape)
         with PeakMemory((*codec.parameters(), *codec.buffers())) as memory:
             codec.encode(images)
     return memory.peak_bytes

@@ -68,6 +68,24 @@ def initial_model(
     return model
 
 
+def initial_codec(config: NetworkConfig, files: WanFiles) -> JointWorldModel:
+    """A model of the full size of which the autoencoder and the text encoder alone are loaded.
+
+    Raises as `initial_model`.
+    """
+    model = JointWorldModel(config)
+    if not isinstance(model.codec, WanVideoCodec) or files.folder is None:
+        raise InvalidInputError(
+            f"autoencoder: got video_expert {config.video_expert} and folder {files.folder}, "
+            "expected wan and the local folder of Wan2.2-TI2V-5B; use --preset wan22-5b and "
+            "--wan.folder, or --init"
+        )
+    _load_autoencoder(model.codec, files.folder, files.max_bytes)
+    if model.text_features is not None:
+        model.text_features.use(files.folder, files.text_cache)
+    return model
+
+
 def freeze_pretrained(model: JointWorldModel) -> None:
     """Train neither the transformer nor the autoencoder of Wan2.2, but adapters."""
     for name, weight in model.named_parameters():
@@ -109,10 +127,14 @@ def load_pretrained(model: JointWorldModel, folder: Path, *, max_bytes: int | No
     load_weights(
         transformer, folder / "transformer", where="Wan2.2 transformer", max_bytes=max_bytes
     )
-    load_weights(codec.autoencoder, folder / "vae", where="Wan2.2 autoencoder", max_bytes=max_bytes)
+    _load_autoencoder(codec, folder, max_bytes)
     # The only tensor that belongs to no module of its own.
     expert.scale_shift_table = transformer.scale_shift_table
     condition.text_features.use(folder)
+
+
+def _load_autoencoder(codec: WanVideoCodec, folder: Path, max_bytes: int | None) -> None:
+    load_weights(codec.autoencoder, folder / "vae", where="Wan2.2 autoencoder", max_bytes=max_bytes)
 
 
 class _Transformer(nn.Module):

@@ -4,14 +4,13 @@ Only ids travel, in the header `traceparent`. Spans are exported where the SDK o
 installed and configured (`dextouch.serving.spans`).
 """
 
+import os
 import re
-import secrets
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, NamedTuple
 
 TRACEPARENT: Final = "traceparent"
 NOT_SAMPLED: Final = "00"
@@ -20,8 +19,7 @@ _FORM = re.compile(r"(?!ff)([0-9a-f]{2})-([0-9a-f]{32})-([0-9a-f]{16})-([0-9a-f]
 _current: ContextVar["TraceContext | None"] = ContextVar("trace_context", default=None)
 
 
-@dataclass(frozen=True)
-class TraceContext:
+class TraceContext(NamedTuple):
     """A span of a trace: ids in hexadecimal, and the flags of W3C (01 is sampled)."""
 
     trace_id: str
@@ -35,12 +33,12 @@ class TraceContext:
 
     def child(self) -> "TraceContext":
         """A new span of the same trace."""
-        return replace(self, span_id=secrets.token_hex(8))
+        return TraceContext(self.trace_id, os.urandom(8).hex(), self.flags)
 
 
 def new_trace(trace_id: str | None = None) -> TraceContext:
     """The first span of a new trace, or a new one of the trace of this id."""
-    drawn = secrets.token_hex(24)
+    drawn = os.urandom(24).hex()
     return TraceContext(trace_id or drawn[:32], drawn[32:])
 
 

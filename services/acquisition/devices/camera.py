@@ -83,7 +83,7 @@ class CameraDecoder(StreamDecoder[Packet]):
 
     @property
     def quality(self) -> ImageQuality:
-        """What the images are like; of H.264 nothing is looked at."""
+        """What the images are like; of H.264 their content only."""
         return self._checker.quality
 
     def reset(self) -> None:
@@ -106,7 +106,8 @@ class CameraDecoder(StreamDecoder[Packet]):
     def _is_undamaged(self, group: list[Sample]) -> bool:
         try:
             if group:
-                check_group([sample.values.item() for sample in group], self._size)
+                for picture in check_group([s.values.item() for s in group], self._size):
+                    self._checker.see(picture)
         except CorruptDataError:
             self.statistics.refused += len(group)
             return False
@@ -150,7 +151,7 @@ class CameraDecoder(StreamDecoder[Packet]):
                 # Its pictures are checked when its group is complete.
                 check_encoded_image(self._descriptor, body, where=self._stream)
             else:
-                check_jpeg(body, self._size, where=self._stream)
+                self._checker.see(check_jpeg(body, self._size, where=self._stream))
         except (CorruptDataError, InvalidInputError):
             return None
         return encoded_values([body]).reshape(())

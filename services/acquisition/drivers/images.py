@@ -18,7 +18,14 @@ from jaxtyping import UInt8
 from dextouch import episodes
 from dextouch.errors import CorruptDataError, DeviceError, NotFoundError
 from dextouch.images import encode_jpeg
-from dextouch.streams import Sample, encoded_values
+from dextouch.streams import (
+    ImageFault,
+    Sample,
+    encoded_values,
+    image_faults,
+    is_same_picture,
+    thumbnail,
+)
 from services.acquisition.drivers.packets import DecoderStatistics
 
 CHECK_EVERY = 3
@@ -38,6 +45,8 @@ DARK_LEVEL, BRIGHT_LEVEL = 5, 250
 # A gap of the driver's stamps stays a current flag for this long.
 GAP_PERIODS = 1.5
 GAP_SHOWN_NS = 1_000_000_000
+# Pictures that are judged together, as often as so many are new; the newest wait for what follows.
+JUDGED_PICTURES, NEW_PICTURES, LATER_PICTURES = 60, 15, 5
 _CHECKSUM_ROWS = 90
 _QUARTER = 4
 ImageEncoding = Literal["rgb8", "jpeg", "h264"]
@@ -53,10 +62,13 @@ class ImageQuality:
     `blurred`: sharpness is below 0.3 of the session's median; `clipped_ratio`: pixels at the dark
     or the bright end; `gap`: an image is missing in the driver's timestamps within the last second.
     Sharpness and exposure are those of the checked images; dropped ones found the encoder's queue
-    full.
+    full. `fault` is what no working camera sends, of the last half second; `still_s` how long the
+    content has been the same but for noise.
     """
 
     frozen: bool = False
+    fault: ImageFault | None = None
+    still_s: float = 0.0
     blurred: bool = False
     clipped_ratio: float = 0.0
     gap: bool = False
@@ -67,6 +79,7 @@ class ImageQuality:
     num_clipped: int = 0
     num_gaps: int = 0
     num_dropped: int = 0
+    num_faulty: int = 0
 
     @property
     def clipped(self) -> bool:
@@ -80,6 +93,7 @@ class ImageQuality:
             "image_blurred": self.num_blurred,
             "image_clipped": self.num_clipped,
             "image_gap": self.num_gaps,
+            "image_content": self.num_faulty,
             "queue": self.num_dropped,
         }
 
@@ -119,6 +133,9 @@ class ImageChecker:
         self._last_t_ns: int | None = None
         self._gap_seen_ns: int | None = None
         self._median = SessionMedian()
+        self._pictures: deque[np.ndarray] = deque(maxlen=JUDGED_PICTURES)
+        self._still: list[np.ndarray] = []
+        self._num_new = 0
 
     @property
     def quality(self) -> ImageQuality:
@@ -129,6 +146,7 @@ class ImageChecker:
         """Look at the next image (RGB); the driver's stamps, if it gives any, must grow."""
         step = max(1, min(image.shape[:2]) // _CHECKSUM_ROWS)
         self.note(image[::step, ::step].tobytes(), t_ns)
+        self.see(image)
         if (self._found.num_images - 1) % CHECK_EVERY == 0:
             self.look(image)
 
@@ -152,6 +170,23 @@ class ImageChecker:
         self._found.num_frozen += self._found.frozen
         if t_ns is not None:
             self._note_stamp(t_ns)
+
+    def see(self, image: UInt8[np.ndarray, "h w c"]) -> None:
+        """Judge the next image, or a small or gray copy of it, beside the others."""
+        picture, found = thumbnail(image), self._found
+        self._pictures.append(picture)
+        if not self._still or not is_same_picture(picture, self._still[0]):
+            self._still, found.still_s = [picture], 0.0
+        found.still_s += self._period_ns * 1e-9
+        self._num_new += 1
+        if self._num_new < NEW_PICTURES or len(self._pictures) < JUDGED_PICTURES // 2:
+            return
+        stop, self._num_new = len(self._pictures) - LATER_PICTURES, 0
+        faults, judged = image_faults(np.stack(self._pictures)), slice(stop - NEW_PICTURES, stop)
+        new = {name: int(m[judged].sum()) for name, m in faults.items() if m[judged].any()}
+        rising = sorted(new, key=new.__getitem__)
+        found.fault = rising[-1] if rising else None
+        found.num_faulty += sum(new.values())
 
     def look(self, image: UInt8[np.ndarray, "h w 3"]) -> None:
         """Sharpness and exposure of an image."""

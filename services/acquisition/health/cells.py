@@ -21,6 +21,8 @@ from dextouch.streams import (
     TAXEL_UNIT,
     StreamDescriptor,
     TaxelFaults,
+    drifting_taxels,
+    implausible_gain,
     neighbour_share,
     share_around,
 )
@@ -52,6 +54,12 @@ MIN_TARE_COUNTS = 20.0
 TARE_SIGMA_COUNTS = 1.0
 MAX_TOUCHED_SHARE = 0.25
 DRIFT_NS = 10_000_000_000
+MAX_ZEROS = 120
+PLACES = {
+    "saturated": " in {}: pressures end at the highest reading",
+    "drifting": " in {}: tare the glove again once it is warm",
+    "ghost": " in {}: their row has a part of another one; check its wiring",
+}
 # Evaluations come once a second; one may be late.
 MAX_STEP_NS = 1_500_000_000
 PINNED_STATES: Final[tuple[TaxelState, ...]] = ("dead", "stuck", "saturated")
@@ -275,6 +283,16 @@ class TaxelCheck(_PressureCheck):
         self._sigma_counts = max(TARE_SIGMA_COUNTS, sigma_counts)
         none = np.zeros(layout.num_taxels, dtype=np.bool_)
         self._refused = none if refused is None else refused
+        self._usable = ~self._refused & (self._indices != NO_CELL)
+        self._drifts = none
+        # Lowest pressures of parts of 5 s, for some ten minutes.
+        self._zeros: deque[np.ndarray] = deque(maxlen=MAX_ZEROS)
+        good = self._usable & (self._gain_counts_per_kpa > 0)
+        self._gain_text = (
+            implausible_gain(self._gain_counts_per_kpa[good], layout.areas_m2[good], layout)
+            if layout.unit == "counts" and good.any()
+            else None
+        )
         self._faults, self._faults_ns = self._begin(), 0
         self._found: list[Finding] = []
         # The readings at which it was found frozen, and since when.
@@ -294,7 +312,7 @@ class TaxelCheck(_PressureCheck):
         return TaxelFaults(
             self._tare_counts,
             self._gain_counts_per_kpa,
-            usable=~self._refused & (self._indices != NO_CELL),
+            usable=self._usable,
             layout=self._layout,
         )
 
@@ -317,13 +335,25 @@ class TaxelCheck(_PressureCheck):
             judged.judge("frozen", lasted_s, one.message)
             if one.samples[-1] and one.cause == "frozen":
                 self._frozen = taxels[-1], now_ns - round(lasted_s * 1e9)
-        for reason in ("random", "copied"):
-            if count := int(part.faults()[reason].sum()):
+        faults = part.faults()
+        self._zeros.append(part.blocks.lows_kpa.min(axis=0))
+        drifts = drifting_taxels(np.stack(self._zeros), self._usable, self._layout)
+        faults["drifting"] = self._drifts = drifts
+        # At full scale they have a code of their own.
+        top_kpa = (self._top - self._tare_counts) / self._gain_counts_per_kpa
+        faults["saturated"] &= part.highest_kpa() < top_kpa
+        for reason in ("random", "copied", *PLACES):
+            if count := int(faults[reason].sum()):
                 is_error = count >= CODES["taxels_dead"].error * self._layout.num_taxels
+                pads = zip(self._layout.pads, self._layout.starts, strict=True)
+                where = [p.part for p, at in pads if faults[reason][at : at + p.num_taxels].any()]
                 text = f"{count} taxels are {reason}"
+                text += PLACES[reason].format(", ".join(where)) if reason in PLACES else ""
                 judged.findings.append(
                     Finding("implausible", "ERROR" if is_error else "WARN", text)
                 )
+        if self._gain_text:
+            judged.findings.append(Finding("implausible", "ERROR", self._gain_text))
         self._found, self._faults, self._faults_ns = judged.findings, self._begin(), 0
 
     def _readings(self, values: np.ndarray) -> np.ndarray:
@@ -350,7 +380,7 @@ class TaxelCheck(_PressureCheck):
             evaluation,
             {
                 **{state: found[f"taxels_{state}"] for state in PINNED_STATES},
-                "drifting": self._drifting(evaluation.now_ns, low),
+                "drifting": self._drifting(evaluation.now_ns, low) | self._drifts,
                 "refused": self._refused,
                 "absent": self._indices == NO_CELL,
             },

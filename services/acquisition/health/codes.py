@@ -111,6 +111,8 @@ CODES: Final[Mapping[str, Rule]] = {
         "Fix tracker and base stations in place so that nothing vibrates."),
     "image_frozen": Rule(0.0, 1.0, "s", "now", "how long the same image comes again and again",
         "Reconnect the camera; it repeats the same image."),
+    "image_content": Rule(0.0, 1.0, "s", "now", "how long images come that no camera takes",
+        "Reconnect the camera and restart its bridge; check what else reads it, and the light."),
     "image_blurred": Rule(0.0, 1.0, "s", "now", "how long images are much less sharp than usual",
         "Clean the lens and adjust the focus."),
     "image_clipped": Rule(0.0, 1.0, "s", "now", "how long over 20 % of the image is black or white",

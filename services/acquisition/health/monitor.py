@@ -39,6 +39,7 @@ from services.acquisition.health.streams import (
     BodiesCheck,
     CameraCheck,
     FiniteCheck,
+    HandsCheck,
     LinkCheck,
     PlausibilityCheck,
     PoseCheck,
@@ -194,8 +195,8 @@ class HealthMonitor:
         descriptors = [descriptor for s in supervisors for descriptor in s.driver.descriptors]
         # Heads and wrists of robots may be anywhere.
         of_robot = any(descriptor.kind == "robot_state" for descriptor in descriptors)
-        bodies = None if of_robot else BodiesCheck(calibration)
-        streams = [stream for s in supervisors for stream in _watch(s, calibration, paths, bodies)]
+        person = None if of_robot else (BodiesCheck(calibration), HandsCheck(calibration))
+        streams = [stream for s in supervisors for stream in _watch(s, calibration, paths, person)]
         self._streams = {stream.name: stream for stream in streams}
         self.queues = {stream.name: stream.queue for stream in streams}
         self.nominal_rates_hz = {d.name: d.nominal_rate_hz for d in descriptors}
@@ -335,7 +336,7 @@ def _watch(
     supervisor: DeviceSupervisor,
     calibration: Mapping[str, schemas.Matrix],
     paths: PathWatch | None,
-    bodies: BodiesCheck | None,
+    person: tuple[BodiesCheck, HandsCheck] | None,
 ) -> list[_WatchedStream]:
     """The streams of one device, each with the checks for its kind."""
     watched = []
@@ -352,8 +353,13 @@ def _watch(
         elif not descriptor.capabilities.sequence:
             judges.append(CountingCheck(descriptor))
         judges += _value_judges(driver, descriptor, calibration)
-        if bodies is not None and descriptor.name in BODIES:
-            judges.append(bodies.of(descriptor.name))
+        if descriptor.kind == "image":
+            bodies = None if person is None else person[0]
+            judges.append(CameraCheck(driver, descriptor.name, bodies))
+        if person is not None and descriptor.name in BODIES:
+            judges.append(person[0].of(descriptor.name))
+        if person is not None and descriptor.name.startswith(("keypoints", "tactile", "wrist")):
+            judges.append(person[1].of(descriptor))
         if "occluded" in driver.events():
             judges.append(TrackingCheck(supervisor.events))
         if paths is not None and paths.num_failures(descriptor.name) is not None:
@@ -384,7 +390,7 @@ def _value_judges(
         return [PoseCheck(descriptor), PlausibilityCheck(descriptor, of_robot=of_robot)]
     if descriptor.kind == "robot_state":
         return [PlausibilityCheck(descriptor)]
-    return [CameraCheck(driver)] if descriptor.kind == "image" else []
+    return []
 
 
 def _device_health(supervisor: DeviceSupervisor, *, simulated: bool) -> schemas.DeviceHealth:

@@ -12,13 +12,20 @@ from dextouch.geometry import nearest_index, pose_from_transform, transform_from
 from dextouch.schemas import Matrix
 from dextouch.streams import (
     BODIES,
+    IMAGE_FAULTS,
     MOUNTS,
+    TAXEL_UNIT,
+    TRACKERS,
+    TURNED_RAD,
+    HandTraces,
     Sample,
     StreamDescriptor,
     implausible_bodies,
     implausible_values,
+    turned_rad,
 )
 from services.acquisition.drivers.base import Driver
+from services.acquisition.health.cells import NO_CELL, GloveRecord, glove_record, is_ours
 from services.acquisition.health.evaluation import (
     WINDOW_NS,
     Block,
@@ -56,8 +63,12 @@ REST_NS = 1_000_000_000
 MIN_REST_SAMPLES = 40
 # Long enough for a hundred samples of most trackers, and short enough to show a change soon.
 PLAUSIBLE_NS = 5_000_000_000
+# A content that stays for longer while its camera moves is none of now.
+MIN_STILL_S = 1.5
 # Poses of bodies that are compared of that time.
 MAX_COMPARED = 100
+# Half seconds in which motion and touch of hands are compared.
+HAND_BINS = 120
 # What is kept between two evaluations, which are a second apart.
 KEPT_S = 4.0
 JUDGED_VALUES = ("tactile", "pose", "keypoints", "robot_state")
@@ -303,6 +314,14 @@ class BodiesCheck:
         """The check of one stream."""
         return partial(self._judge, name)
 
+    def turned_rad(self, name: str, since_ns: int) -> float:
+        """By how much a tracker turned since then (5 s at most), or moved past what is 1 m away."""
+        poses = [values[t_ns >= since_ns] for t_ns, values in self._poses.get(name, ())]
+        if not sum(map(len, poses)):
+            return 0.0
+        Ts = transform_from_pose(np.concatenate(poses).astype(np.float64))
+        return float(turned_rad(Ts[:1], Ts).max())
+
     def _judge(self, name: str, evaluation: Evaluation) -> None:
         block = evaluation.block
         if block.values is not None and len(block):
@@ -321,6 +340,42 @@ class BodiesCheck:
         found = implausible_bodies(poses, to_body, of_robot=False)
         if found is not None and found.stream == name:
             evaluation.findings.append(Finding("implausible", "ERROR", found.message))
+
+
+class HandsCheck:
+    """Judges whether wrists and gloves of the last minute go with their hands, as alignment does.
+
+    One for all of a person's devices; `calibration` has tares and gains of the gloves.
+    """
+
+    def __init__(self, calibration: Mapping[str, Matrix]) -> None:
+        self._calibration = calibration
+        self._traces = HandTraces(HAND_BINS)
+
+    def of(self, descriptor: StreamDescriptor) -> Callable[[Evaluation], None]:
+        """The check of one stream."""
+        record = glove_record(descriptor, self._calibration) if is_ours(descriptor) else None
+        return partial(self._judge, descriptor, record)
+
+    def _judge(
+        self, descriptor: StreamDescriptor, record: GloveRecord | None, evaluation: Evaluation
+    ) -> None:
+        block, layout = evaluation.block, None
+        if block.values is None or not len(block):
+            return
+        values = block.values
+        if descriptor.kind == "tactile":
+            layout = descriptor.tactile_layout
+            if record is not None:
+                kpa = (values - record.tare_counts) / record.gain_counts_per_kpa
+                values = np.where(record.cells == NO_CELL, 0.0, kpa[:, record.cells])
+            elif descriptor.unit != TAXEL_UNIT:
+                return
+        self._traces.add(descriptor.name, block.t_host_ns, values, layout)
+        cause, message = self._traces.found().get(descriptor.name, ("", ""))
+        if cause:
+            code = "frozen" if cause == "frozen" else "implausible"
+            evaluation.findings.append(Finding(code, "ERROR", message))
 
 
 def _mounted(poses: np.ndarray, T: np.ndarray) -> np.ndarray:
@@ -354,8 +409,8 @@ class FiniteCheck:
 class CameraCheck:
     """Judges one camera: anything is a warning, and an error after a second."""
 
-    def __init__(self, driver: Driver) -> None:
-        self._driver = driver
+    def __init__(self, driver: Driver, name: str, bodies: BodiesCheck | None = None) -> None:
+        self._driver, self._tracker, self._bodies = driver, TRACKERS.get(name, ""), bodies
         self._since_ns: dict[str, int] = {}
 
     def __call__(self, evaluation: Evaluation) -> None:
@@ -363,9 +418,14 @@ class CameraCheck:
         quality, now_ns = self._driver.quality, evaluation.now_ns
         if quality is None:
             return
-        clipped = quality.clipped_ratio
+        fault, clipped = quality.fault, quality.clipped_ratio
+        frozen, text = quality.frozen, "the same image repeatedly"
+        if not frozen and quality.still_s > MIN_STILL_S and self._bodies is not None:
+            turned = self._bodies.turned_rad(self._tracker, now_ns - round(quality.still_s * 1e9))
+            frozen, text = turned > 2 * TURNED_RAD, "shows the same while the camera moves"
         flags = {
-            "image_frozen": (quality.frozen, "the same image repeatedly"),
+            "image_frozen": (frozen, text),
+            "image_content": (fault is not None, IMAGE_FAULTS[fault or "torn"]),
             "image_blurred": (quality.blurred, "much less sharp than usual"),
             "image_gap": (quality.gap, "images are missing according to its timestamps"),
             "image_clipped": (quality.clipped, f"{clipped:.0%} of the image black or white"),
@@ -378,7 +438,7 @@ class CameraCheck:
             evaluation.judge(code, max(1, now_ns - since_ns) / 1e9, flags[code][1])
         evaluation.figures |= {
             "image_clipped_ratio": clipped,
-            "image_frozen": float(quality.frozen),
+            "image_frozen": float(frozen),
             "image_blurred": float(quality.blurred),
         }
 

@@ -36,6 +36,8 @@ SMALLEST_NOISE_STEP = 1e-3
 PRIOR_LOG_SIGMA = 1.4
 # Lower bound of a variance, as a share of the declared one.
 MIN_SHARE = 1e-6
+# Of the expected variance of the scale, below which the views alone determine it.
+MAX_SCALE_SHARE = 0.1
 # A pose that is known worse than this is of no use (one sigma, three axes together).
 MAX_SIGMA_ROTATION_RAD = np.deg2rad(0.5)
 MAX_SIGMA_TRANSLATION_M = 0.01
@@ -112,13 +114,15 @@ class Bundle:
     """The mount X, the target's pose Z in the world, the scale, and how well they are known.
 
     `scale` is true over measured lengths of the second series. The covariance is of the twists of
-    X, then of Z (rad, m, in their own frames), then of log scale; zero for what was given.
+    X, then of Z (rad, m, in their own frames), then of log scale; zero for what was given. It is
+    `excess` times that of independent errors.
     """
 
     X: Float64[np.ndarray, "4 4"]
     Z: Float64[np.ndarray, "4 4"]
     scale: float
     covariance: Float64[np.ndarray, "13 13"]
+    excess: float = 1.0
 
 
 def weighted_bundle(
@@ -157,8 +161,11 @@ def weighted_bundle(
     J, C = predicted_jacobians(Ts, bundle.X @ Ts, bundle.scale)
     Ts[:, :3, 3] /= bundle.scale
     left_over = (whiten @ twist(invert(series.Ts_mounted_target) @ Ts)[..., None])[..., 0]
+    if bundle.covariance[12, 12] < MAX_SCALE_SHARE * scale_sigma**2:
+        # What was expected leaves nothing of it in the residuals.
+        free = free[free < 12]
     excess = excess_over_time(series, left_over, whiten @ J, whiten @ C, free, declared)
-    return replace(bundle, covariance=excess * bundle.covariance), sigmas
+    return replace(bundle, covariance=excess * bundle.covariance, excess=excess), sigmas
 
 
 def sensor_components(

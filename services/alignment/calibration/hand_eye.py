@@ -26,6 +26,7 @@ from services.alignment.calibration.bundle import (
 )
 from services.alignment.calibration.motion import (
     AXIS_NAMES,
+    MAX_CHANCE,
     MIN_VIEWS,
     WANTED_ROTATION_RAD,
     WANTED_TRANSLATION_M,
@@ -33,6 +34,7 @@ from services.alignment.calibration.motion import (
     Series,
     adjoint,
     agreeing_views,
+    check_mount,
     checked_poses,
     mean_series,
     missing_axes,
@@ -48,6 +50,11 @@ BASE_TASK = "robot base"
 MIN_CORNERS = 4
 # Expected of a robot that reports its pose: rotation (rad) and translation (m), an axis.
 ROBOT_SIGMA = (3e-4, 2e-4)
+# Corners contradict the lens by so much (px RMS, and share
+# of all): distortion or 2 % of a focal length left out. Less moves mounts within sigma.
+MIN_LENS_MISFIT_PX, MIN_LENS_SHARE = 0.15, 0.45
+# Of lengths of robot and tracker: of a base station's set-up, and a robot's nominal links.
+ROBOT_SCALE_SIGMA = 3e-3
 # Where the tracker's place is given, the effector must at least move so far in two directions.
 MIN_SECOND_SPREAD_M = 0.05
 # A board whose size differs by more sigmas from the entered one is refused.
@@ -200,6 +207,7 @@ def solve_hand_eye(
     else:
         one_pixel = views.only(agreed.views).measurement(1.0)
         polished = polish(one_pixel, agreed.series.Ts_mounted_target)
+        _check_lens(views.only(agreed.views), polished)
         agreed = agreed._replace(series=agreed.series._replace(Ts_mounted_target=polished))
         labels = place_labels(agreed.series)
         placed = agreed._replace(series=mean_series(agreed.series, labels))
@@ -207,7 +215,8 @@ def solve_hand_eye(
         np.add.at(information, labels, one_pixel(polished).information)
         own_noise = {"pixel_px": Component(noise.pixel_px, np.linalg.inv(information))}
     bundle, sigmas = weighted_bundle(placed, noise, own_noise, scale_sigma=noise.board_scale)
-    _check_scale(bundle, noise.board_scale, names)
+    _check_scale(TASK, bundle, noise.board_scale, names)
+    check_mount(TASK, names, bundle.X)
     result = HandEyeResult(
         covariance=bundle.covariance[:6, :6],
         noise=sigmas,
@@ -232,17 +241,39 @@ def solve_hand_eye(
     )
 
 
-def _check_scale(bundle: Bundle, expected_sigma: float, names: tuple[str, str]) -> None:
-    """Refuse views that say, without what was expected, that the board is of another size."""
-    variance = bundle.covariance[12, 12]
+def _check_lens(views: BoardViews, Ts_camera_board: np.ndarray) -> None:
+    """Refuse corners that a lens of another K or distortion shows; boards at their best poses."""
+    from services.alignment.calibration.lens_fit import known_lens_misfit
+
+    corners = (views.points_board, views.pixels_px)
+    lens, board = known_lens_misfit(corners, views.K, views.distortion, Ts_camera_board)
+    num, squares = sum(map(len, views.points_board)), lens.explained + lens.rest * lens.freedom
+    off_px, rms_px = np.sqrt(np.array([lens.explained, squares]) / num)
+    if lens.p_value > MAX_CHANCE or off_px < max(MIN_LENS_MISFIT_PX, MIN_LENS_SHARE * rms_px):
+        return
+    longer = float(np.mean(lens.coefficients[:2] / np.diag(views.K)[:2]))
+    cause = (
+        "a board that is bent, or longer along one axis; use a flat print to scale"
+        if board.explained > lens.explained
+        else f"focal lengths that are {longer:+.1%} longer, or another centre or distortion; "
+        "calibrate the camera anew, with the same lens, zoom and image size"
+    )
+    raise InvalidInputError(
+        f"{TASK}: corners of the board fit to {rms_px:.2f} px RMS; {off_px:.2f} px show {cause}"
+    )
+
+
+def _check_scale(task: str, bundle: Bundle, expected_sigma: float, names: tuple[str, str]) -> None:
+    """Refuse series that say, without what was expected, that they differ in scale."""
+    variance = bundle.covariance[12, 12] / bundle.excess
     # Information of the views alone; what was expected is a Gaussian about one.
     information = 1 / variance - 1 / expected_sigma**2
     if information < MIN_SCALE_INFORMATION / expected_sigma**2:
         return
-    own_variance = 1 / information
-    log_scale = np.log(bundle.scale) * own_variance / variance
+    log_scale = np.log(bundle.scale) / information / variance
+    own_variance = bundle.excess / information
     if abs(log_scale) > NUM_SCALE_SIGMAS * np.hypot(np.sqrt(own_variance), expected_sigma):
-        raise wrong_scale(TASK, names, float(np.exp(log_scale)), float(np.sqrt(own_variance)))
+        raise wrong_scale(task, names, float(np.exp(log_scale)), float(np.sqrt(own_variance)))
 
 
 def board_components(Ts_camera_board: np.ndarray, noise: HandEyeNoise) -> dict[str, Component]:
@@ -338,7 +369,9 @@ def solve_robot_base(
     agreed = agreed._replace(series=mean_series(agreed.series, place_labels(agreed.series)))
     # The robot errs in the effector's axes.
     own = sensor_components("robot", adjoint(invert(agreed.predicted)), ROBOT_SIGMA)
-    bundle, sigmas = weighted_bundle(agreed, TrackerNoise(), own)
+    bundle, sigmas = weighted_bundle(agreed, TrackerNoise(), own, scale_sigma=ROBOT_SCALE_SIGMA)
+    _check_scale(BASE_TASK, bundle, ROBOT_SCALE_SIGMA, names)
+    check_mount(BASE_TASK, names, bundle.X)
     _, errors = view_errors(agreed.series, bundle.X)
     rotation_rms_rad, translation_rms_m = np.sqrt(np.square(errors).mean(axis=0)).tolist()
     result = RobotBaseResult(

@@ -39,9 +39,9 @@ MAX_SAME_PLACE = 0.005
 # probability of a mistake, and this large (px RMS). What is smaller is part of the sigmas.
 MAX_CHANCE = 1e-6
 MIN_MISFIT_SHARE, MIN_MISFIT_PX = 0.5, 0.3
-# Change of the focal length along the photos; a smaller one is part of the sigmas. That of 13
-# photos of a real camera is 0.1 %.
-MAX_FOCAL_DRIFT = 0.01
+# Of the focal length, RMS from photo to photo, as of lenses that zoom or focus anew meanwhile; less
+# is part of the sigmas. That of 13 photos of a real camera is 0.1 %.
+MAX_FOCAL_SPREAD = 0.005
 # The fisheye model is named where it leaves less than this of the residual.
 FISHEYE_SHARE = 0.7
 # Wider edges are blurred. Measured on rendered ChArUco boards: sharp 2.0 to 2.2 px, out of focus by
@@ -106,6 +106,8 @@ class CameraCalibration:
         rms_px: of the residuals, both axes together; as small for 8 views as for 40.
         rms_by_place_px: the same by place of the board; a much larger one is of a blurred photo.
         board_bend_m: height of the board's bend, which is estimated where the corners show it.
+        board_stretch: by how much the print is longer along its columns' axis (x) than along the
+            other, as a share, likewise.
         coverage: share of a 4 × 4 grid over the image in which corners were seen.
         used_images: indices of the photos on which the board was found and fits the others.
     """
@@ -117,6 +119,7 @@ class CameraCalibration:
     rms_px: float
     rms_by_place_px: Float64[np.ndarray, " n"]
     board_bend_m: float
+    board_stretch: float
     coverage: float
     used_images: tuple[int, ...]
 
@@ -264,32 +267,52 @@ def _fitted(places: list[_Place], size_px: tuple[int, int]) -> "LensFit":
 
 
 def _check_lens(fit: "LensFit", places: list[_Place], size_px: tuple[int, int]) -> None:
-    from services.alignment.calibration.lens_fit import fisheye_rms_px
+    from services.alignment.calibration.lens_fit import MAX_NAMED_BEND, fisheye_rms_px, fit_lens
 
-    image = fit.image.p_value < MAX_CHANCE and fit.image_share > MIN_MISFIT_SHARE
-    if image and fit.misfit_px > MIN_MISFIT_PX:
-        points, pixels, _ = zip(*places, strict=True)
-        fisheye_px = fisheye_rms_px(points, pixels, size_px)
-        reason = (
-            f"an equidistant (fisheye) lens fits with {fisheye_px:.2f} px RMS, the pinhole model "
-            f"with {fit.rms_px:.2f} px; use a lens of less than 100 degrees, or undistort the "
-            "images to a pinhole camera with cv2.fisheye before recording"
-            if fisheye_px < FISHEYE_SHARE * fit.rms_px
-            else f"residuals follow the place in the image by {fit.misfit_px:.2f} px of "
-            f"{fit.rms_px:.2f} px RMS; check that the photos are whole images of one camera, "
-            "without stabilisation and with one size of the board"
+    problem = _problem(fit)
+    if not problem:
+        return
+    points, pixels, _ = zip(*places, strict=True)
+    fisheye_px = fisheye_rms_px(points, pixels, size_px)
+    bent = fit_lens(points, pixels, size_px, max_bend=MAX_NAMED_BEND)
+    if fisheye_px < FISHEYE_SHARE * fit.rms_px:
+        problem = (
+            "the camera is no pinhole with distortion k1 k2 p1 p2 k3: an equidistant (fisheye) "
+            f"lens fits with {fisheye_px:.2f} px RMS, the pinhole model with {fit.rms_px:.2f} px; "
+            "use a lens of less than 100 degrees, or undistort the images to a pinhole camera with "
+            "cv2.fisheye before recording"
         )
-        raise LensModelError(
-            f"intrinsics: the camera is no pinhole with distortion k1 k2 p1 p2 k3: {reason}",
-            rms_px=fit.rms_px,
-            fisheye_rms_px=fisheye_px,
+    elif bent.rms_px < FISHEYE_SHARE * fit.rms_px:
+        problem = (
+            f"the board is bent by {bent.board_bend_m * 1e3:.1f} mm, which leaves "
+            f"{bent.rms_px:.2f} px RMS instead of {fit.rms_px:.2f}; glue it to a flat plate, and "
+            "take all photos anew"
         )
-    if fit.drift.p_value < MAX_CHANCE and fit.focal_drift > MAX_FOCAL_DRIFT:
-        raise LensModelError(
-            f"intrinsics: the focal length changed by {fit.focal_drift:.1%} from the first photo "
-            "to the last; switch autofocus, zoom and stabilisation off, and take all photos anew",
-            focal_drift=fit.focal_drift,
+    raise LensModelError(
+        f"intrinsics: {problem}",
+        rms_px=fit.rms_px,
+        fisheye_rms_px=fisheye_px,
+    )
+
+
+def _problem(fit: "LensFit") -> str:
+    """Why no camera of the model took the photos, or different ones did; else empty."""
+    is_off = fit.image.p_value < MAX_CHANCE and fit.image_share > MIN_MISFIT_SHARE
+    if is_off and fit.misfit_px > MIN_MISFIT_PX:
+        return (
+            "the camera is no pinhole with distortion k1 k2 p1 p2 k3: residuals follow the place "
+            f"in the image by {fit.misfit_px:.2f} px of {fit.rms_px:.2f} px RMS; check that the "
+            "lens is no fisheye, the photos are whole images of one camera, without stabilisation, "
+            "and all of one board"
         )
+    if fit.focal_p < MAX_CHANCE and fit.focal_spread > MAX_FOCAL_SPREAD:
+        return (
+            f"the focal length seems to differ by {fit.focal_spread:.1%} RMS from photo to photo; "
+            "switch autofocus, zoom and stabilisation off, hold camera and board still (rolling "
+            "shutters distort what moves), check that all photos are of one camera, and take them "
+            "anew"
+        )
+    return ""
 
 
 def _calibration(
@@ -305,6 +328,7 @@ def _calibration(
         rms_px=fit.rms_px,
         rms_by_place_px=fit.rms_by_photo_px,
         board_bend_m=fit.board_bend_m,
+        board_stretch=fit.board_stretch,
         coverage=len(np.unique(cells.astype(int).clip(0, 3), axis=0)) / 16,
         used_images=tuple(sorted(photo for place in places for photo in place.photos)),
     )

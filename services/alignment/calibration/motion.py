@@ -57,6 +57,12 @@ MAX_CHANCE = 1e-6
 MIN_CHANGE = 2.0
 # Of neighbours; independent errors have less in 98 of 100 series.
 MIN_CORRELATION_SIGMAS = 2.0
+# A sensor that is mounted farther from the other is none: both series are inverted or exchanged,
+# which fits as well, with the mount and the target's pose exchanged (chosen).
+MAX_MOUNT_M = 0.5
+# From so many places on 36 functions of the pose are told from noise; what chance would rarely show
+# is part of the sigmas.
+MIN_PLACES_BY_POSE, MAX_POSE_P = 18, 0.01
 # Places on either side of a change; a pose has as many numbers as one of them.
 MIN_SIDE = 3
 
@@ -258,13 +264,28 @@ def check_sides(series: Series, errors: np.ndarray) -> None:
     if not fits:
         return
     length_m, name, again = min(fits, key=lambda fit: fit[0])
+    fixed_camera = (
+        "; or the camera stands still and the tracker is on the board, which is not calibrated here"
+    )
     raise InvalidInputError(
         f"{series.task}: {name} is probably inverted: the views contradict each other by "
         f"{_rms_text(errors)} RMS as given and by {_rms_text(again)} when {name} is turned round "
         f"(the mount is then {length_m * 1e3:.0f} mm long); pass the inverse of each matrix of "
-        f"{name}",
+        f"{name}{fixed_camera if name == 'Ts_camera_board' else ''}",
         inverted=name,
     )
+
+
+def check_mount(task: str, names: tuple[str, str], X: np.ndarray) -> None:
+    """Refuse a mount that is too long to be one; raises InvalidInputError."""
+    length_m = float(np.linalg.norm(X[:3, 3]))
+    if length_m > MAX_MOUNT_M:
+        raise InvalidInputError(
+            f"{task}: the mount would be {length_m:.2f} m long, expected at most {MAX_MOUNT_M:g}; "
+            f"{names[0]} and {names[1]} are probably both inverted, or exchanged, which fits with "
+            "another meaning; check the direction and order of both",
+            length_m=length_m,
+        )
 
 
 def check_scale(series: Series, errors: np.ndarray) -> None:
@@ -285,10 +306,10 @@ def wrong_scale(
     """Error for two series that measure lengths differently."""
     known = f"{scale:.4g}" if sigma is None else f"{scale:.4f} ± {sigma:.4f}"
     return InvalidInputError(
-        f"{task}: lengths of {names[0]} are {known} times those of {names[1]}, expected 1; measure "
-        "the printed board over several squares and enter that size (printers scale pages, and "
-        "other programs give millimetres), and check that the camera's K is of this camera and "
-        "image size",
+        f"{task}: lengths of {names[0]} are {known} times those of {names[1]}, expected 1; give "
+        "both in metres; measure the printed board over several squares and enter that size "
+        "(printers scale pages), and check that the camera's K is of this camera and image size; "
+        "of a robot, check its model and the tracker's set-up of the room",
         scale=scale,
     )
 
@@ -429,7 +450,34 @@ def excess_over_time(
     times = np.linspace(-1, 1, num_places)[:, None, None]
     trends = (times * J[:, :, :12]).reshape(6 * num_places, -1)
     found = structure(left, fitted, np.column_stack([trends, late]))
-    return max(found.ratio, _num_together(left), 1.0)
+    by_pose = _excess_by_pose(series, left, J, fitted, expected)
+    return max(found.ratio, by_pose, _num_together(left), 1.0)
+
+
+def _excess_by_pose(
+    series: Series, left: np.ndarray, J: np.ndarray, fitted: np.ndarray, expected: tuple[float, ...]
+) -> float:
+    """As `excess_over_time`, of mounts that seem to change with the pose.
+
+    So do joints that are off zero, arms that bend, and lenses that are not the camera's.
+    """
+    if len(J) < MIN_PLACES_BY_POSE:
+        return 1.0
+    T = invert(series.Ts_mounted_target)
+    poses = twist(invert(nearest_pose(T)) @ T)
+    found = _change(left, fitted, (J[:, :, :6, None] * poses[:, None, None]).reshape(left.size, -1))
+    explained = (left - found.remaining).reshape(-1, 6, 1)
+    squares = np.square(np.linalg.solve(J[:, :, :6], explained)[..., 0]).mean(axis=0)
+    lengths = np.sqrt(squares.reshape(2, 3).sum(axis=1))
+    is_large = lengths > MIN_CHANGE * np.sqrt(3) * np.array(expected)
+    if found.p_value < MAX_CHANCE and is_large.any():
+        raise InvalidInputError(
+            f"{series.task}: the mount on the {series.body} seems to change with the pose, by "
+            f"{np.rad2deg(lengths[0]):.2f} degrees and {lengths[1] * 1e3:.1f} mm RMS; check that "
+            "the camera's K and distortion are of this lens and image size, or that the robot's "
+            "joint zeros and units are right, and hold still for each view"
+        )
+    return found.ratio if found.p_value < MAX_POSE_P else 1.0
 
 
 class Structure(NamedTuple):

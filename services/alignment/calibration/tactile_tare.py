@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float32, Float64, Int64, Shaped, UInt8
 from numpy.lib.stride_tricks import sliding_window_view
 
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
-from dextouch.streams import MIN_SAMPLES_TO_JUDGE, TaxelFaults
+from dextouch.streams import MIN_SAMPLES_TO_JUDGE, TaxelFaults, implausible_gain
 from dextouch.tactile.layout import DEXTOUCH_V1, Side, TactileLayout
 
 # One second of a 60 Hz glove; with less, drift cannot be separated from the zero.
@@ -47,11 +47,9 @@ BLOCK = 600
 
 # Why a taxel of a take is not measured: what the calibration says, that it has no reading, that its
 # readings have nothing to do with those before, lie below its tare, or are those of another one.
-REASONS = (*STATES, "absent", "random", "below_tare", "copied")
-ABSENT, RANDOM, BELOW_TARE, COPIED = (len(STATES) + number for number in range(4))
+REASONS = (*STATES, "absent", "random", "below_tare", "copied", "drifting", "ghost")
+ABSENT, RANDOM, BELOW_TARE, COPIED, DRIFTING, GHOST = range(len(STATES), len(REASONS))
 NO_CELL = -1
-# A glove of 16 bits has a full scale above 50 kPa.
-MIN_FULL_SCALE_KPA = 50.0
 
 Record = Mapping[str, Sequence[Sequence[float]]]
 # More taxels than this that are random, or below their tare: the glove or its tare is wrong.
@@ -295,8 +293,13 @@ class TactileCalibration:
         state = np.full(len(cells), ABSENT, dtype=np.uint8)
         has_cell = cells != NO_CELL
         state[has_cell] = _states(record, f"{glove}_taxel_state", num_cells)[cells[has_cell]]
-        if layout is None and num_cells == about.num_raw_cells and (state == OK).any():
-            _check_full_scale(gain[cells[state == OK]], f"{glove}_gain_counts_per_kpa")
+        good = (state == OK) & (gain[cells] > 0)
+        is_known = layout is None or layout.unit == "counts"
+        if is_known and num_cells == about.num_raw_cells and good.any():
+            why = implausible_gain(gain[cells[good]], about.areas_m2[good], about)
+            if why is not None:
+                text = f"calibration '{glove}_gain_counts_per_kpa': {why}"
+                raise InvalidInputError(text, fault="unit")
         gain = np.where(state == OK, gain[cells], 1.0)
         return cls(side, num_cells, cells, tare[cells], gain, state, reading_step(about))
 
@@ -338,19 +341,6 @@ def _gain(
     gain = np.ones(num_cells)
     gain[cells[cells != NO_CELL]] = 1.0 / kpa_per_unit[cells != NO_CELL]
     return gain
-
-
-def _check_full_scale(gain_counts_per_kpa: np.ndarray, name: str) -> None:
-    """Refuse gains of our gloves that are per MPa; those per Pa show in what is measured."""
-    gain = float(np.median(gain_counts_per_kpa))
-    # A gain that is not positive is refused by name where the calibration is made.
-    if gain * MIN_FULL_SCALE_KPA > FULL_SCALE_COUNTS:
-        full_scale_kpa = FULL_SCALE_COUNTS / gain
-        raise InvalidInputError(
-            f"calibration {name!r}: makes {full_scale_kpa:.3g} kPa of full scale, expected at "
-            f"least {MIN_FULL_SCALE_KPA:g} kPa; these look like counts/MPa: calibrate it again",
-            fault="unit",
-        )
 
 
 def _row(record: Record, name: str, size: int) -> Float64[np.ndarray, " size"]:
@@ -437,14 +427,20 @@ def unusable_taxels(
     """Why each taxel of a take is unusable, index into `REASONS`; 0 if usable.
 
     Besides those that the calibration refuses: dead, stuck, random, a copy of another cell, mostly
-    below the tare, still while those around them move, or NaN in more than a tenth of the samples.
-    Raises InvalidInputError: more than half of the taxels are random, copied, dead, stuck or below
-    their tare, some read more than any finger presses, or all more than their tare.
+    below the tare, still while those around them move, at a limit for long, on a pad that drifts or
+    in a row with a ghost of another one, or NaN in more than a tenth of the samples.
+    Raises InvalidInputError: more than half of the taxels are random, copied, dead, stuck, at a
+    limit, drifting or below their tare, all are frozen, some read more than any finger presses, or
+    all more than their tare.
     """
     reasons = calibration.state.copy()
     if take.num_samples < MIN_SAMPLES_TO_JUDGE:
         return reasons
     _check_pressures(calibration, take)
+    for one in take.repeats():
+        if one.whole:
+            text = f"{calibration.side} glove: {one.message}: it is frozen; restart it"
+            raise InvalidInputError(text, fault=one.cause)
     for fault, taxels in take.faults().items():
         reasons[(reasons == OK) & taxels] = REASONS.index(fault)
     for reason, what, advice in (
@@ -452,6 +448,8 @@ def unusable_taxels(
         (DEAD, "are zero throughout or from some moment on", "check cable and power"),
         (COPIED, "are those of others", "check cable and firmware"),
         (STUCK, "never change, or no more from some moment on", "restart the glove"),
+        (SATURATED, "end at the highest reading", "press less, or check gain and range"),
+        (DRIFTING, "drift with the zero of their pad", "wait until the glove is warm, and tare it"),
         (BELOW_TARE, "lie below their tare", "tare the glove again"),
     ):
         share = float((reasons == reason)[calibration.state == OK].mean())

@@ -51,6 +51,8 @@ MIN_NEWS = 0.04
 MAX_VIEWS = 80
 # Number of live images without a new view (4 s and more) after which a hint is printed.
 TELL_AFTER_IMAGES = 20
+# Of a print along one axis; less moves mounts by less than their sigma.
+MIN_TOLD_STRETCH = 0.003
 # Of pictures.
 INK, LINE, GOOD, BAD, FAINT = "#1e293b", "#cbd5e1", "#0f766e", "#c2410c", "#94a3b8"
 _WIDTH, _ROW, _CELL = 480.0, 18.0, 9
@@ -134,6 +136,7 @@ def keep_camera(
         "sigma_distortion": result.sigma_distortion.tolist(),
         "rms_px": result.rms_px,
         "board_bend_mm": result.board_bend_m * 1e3,
+        "board_stretch": result.board_stretch,
         "board_kind": photos.pattern,
         "image_size_px": list(photos.size_px),
         "views_by_region": coverage.views_by_region.tolist(),
@@ -151,6 +154,11 @@ def keep_camera(
         f"cx {cx:.2f} ± {sigma[2]:.2f}, cy {cy:.2f} ± {sigma[3]:.2f} px "
         f"({len(result.used_images)} views, residual {result.rms_px:.3f} px RMS)"
     )
+    if abs(result.board_stretch) > MIN_TOLD_STRETCH:
+        say(
+            f"  the print is longer along its columns' axis by {result.board_stretch:+.2%}, as K "
+            "takes into account; print it to scale before you calibrate the mount"
+        )
     return facts
 
 

@@ -21,6 +21,7 @@ from dextouch.schemas import (
 from dextouch.streams import (
     BODIES,
     COMMANDED,
+    HandTraces,
     Implausible,
     StreamDescriptor,
     implausible_bodies,
@@ -30,6 +31,7 @@ from dextouch.streams import (
 from dextouch.tactile.layout import common_layout
 from services.alignment.settings import AlignmentOptions
 from services.alignment.synchronization import OnProgress, progress_within
+from services.alignment.synchronization.checked_images import check_views, looked_at
 from services.alignment.synchronization.grid_actions import (
     ACTION_STREAMS,
     TOUCH_STREAMS,
@@ -149,6 +151,22 @@ def check_bodies(streams: Mapping[str, DatedStream], domain: Domain) -> None:
         )
 
 
+def check_hands(streams: Mapping[str, DatedStream]) -> None:
+    """Refuse wrists and gloves that do not go with their hands; raises InvalidInputError."""
+    traces = HandTraces()
+    if not any(name.startswith("keypoints") for name in streams):
+        return
+    for name, stream in streams.items():
+        if name.startswith(("keypoints", "tactile")) or name in BODIES[1:]:
+            about = stream.descriptor
+            layout = about.tactile_layout if about.kind == "tactile" else None
+            for piece in stream.pieces():
+                traces.add(name, piece.t_ns, piece.values, layout)
+    for name, (cause, message) in traces.found().items():
+        text = f"stream {name!r}: {message}, and record again"
+        raise InvalidInputError(text, fault=cause, stream=name)
+
+
 def _left_out(
     stream: DatedStream, found: list[Implausible]
 ) -> tuple[DatedStream, tuple[tuple[int, int, RefusedReason], ...]]:
@@ -249,12 +267,20 @@ def build_episode(
     streams = _dated_streams(recording, on_progress)
     _check_hands(recording, streams)
     streams = with_tracked_objects(streams, objects, recording.attributes.calibration)
+    looked = {n: looked_at(one) for n, one in streams.items() if one.descriptor.kind == "image"}
+    streams |= {name: stream for name, (stream, _) in looked.items()}
     checked = {
         name: checked_stream(stream, max_gap_ns=options.longest_bridge_ns)
         for name, stream in streams.items()
     }
     streams = {name: one.stream for name, one in checked.items()}
     check_bodies(streams, recording.attributes.domain)
+    check_hands(streams)
+    views = check_views(
+        {name: view for name, (_, view) in looked.items()},
+        streams,
+        recording.attributes.calibration,
+    )
     span = find_span(recording, checked, options, on_progress)
     on_progress(progress_within("retargeting", 0.0))
     source, gridded = recording.attributes, span.gridded
@@ -287,6 +313,7 @@ def build_episode(
         "origin_after_start_ns": float(span.origin_ns - (source.started_t_host_ns or 0)),
         **_stream_quality(streams, options),
         **actions.quality,
+        **views,
     }
     attributes = _episode_attributes(recording, episode_id, actions, streams, quality)
     listed = () if objects is None else objects.tasks[source.task]

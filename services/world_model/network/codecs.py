@@ -146,8 +146,10 @@ class WanVideoCodec(nn.Module):
     def encode(self, images: Images) -> Latents:
         """Latents of images in 0 … 1; time is 1 + 4k."""
         pixels = images.permute(0, 4, 1, 2, 3) * 2.0 - 1.0
+        # One by one: rounding then depends on no other window, so that latents can be kept.
         # The mean of the encoder's distribution, not a sample of it.
-        latents = self.autoencoder.encode(pixels).latent_dist.mode()
+        parts = [self.autoencoder.encode(one).latent_dist.mode() for one in torch.split(pixels, 1)]
+        latents = torch.cat(parts)
         mean, std = _statistics(latents)
         return _tokens_of(((latents - mean) / std).permute(0, 2, 3, 4, 1))
 

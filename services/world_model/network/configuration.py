@@ -56,6 +56,9 @@ class WanFiles(FrozenModel):
     text_cache: Path | None = Field(
         default=None, description="folder in which text features of instructions are kept"
     )
+    latent_cache: Path | None = Field(
+        default=None, description="file in which video latents of training images are kept"
+    )
     max_memory_gb: float | None = Field(
         default=None, gt=0, description="limit of memory for one network; default: what there is"
     )

@@ -20,7 +20,7 @@ from services.world_model.network.attention import (
     clean_mask,
     split_axis,
 )
-from services.world_model.network.codecs import VisualCodec, WanVideoCodec, to_unit
+from services.world_model.network.codecs import Latents, VisualCodec, WanVideoCodec, to_unit
 from services.world_model.network.conditioning import (
     ActionNormalizer,
     Condition,
@@ -178,6 +178,8 @@ class JointWorldModel(nn.Module):
             for layer in self.joint_layers():
                 add_adapters(layer.video, wan.lora_rank, wan.lora_scale)
         self._observed: LastUsed[Observed] | None = None
+        # Finds latents of images, or computes them by its second argument; None: computes all.
+        self.latent_cache: Callable[[Any, Callable[[Any], Latents]], Latents] | None = None
 
     def keep_contexts(self, count: int) -> None:
         """Keep up to `count` results of instruction and first step alone for later chunks.
@@ -230,11 +232,17 @@ class JointWorldModel(nn.Module):
             latents[known] = self._encoded(pixels[known][:, :, None])[:, 0]
         return replace(inputs, past_images=pixels[:, :0], past_latents=latents)
 
+    def encode_images(self, images: UInt8[Tensor, "n time px px 3"]) -> Latents:
+        """Latents of 1 + 4k images each, from the cache if there is one."""
+        if self.latent_cache is None:
+            return self.codec.encode(to_unit(images))
+        return self.latent_cache(images, lambda some: self.codec.encode(to_unit(some)))
+
     def _encoded(
         self, images: UInt8[Tensor, "batch views time px px 3"]
     ) -> Float32[Tensor, "batch latents tokens channels"]:
         """Latents of images, the tokens of each frame view by view."""
-        latents = self.codec.encode(to_unit(images.flatten(0, 1)))
+        latents = self.encode_images(images.flatten(0, 1))
         return split_axis(latents, 0, tuple(images.shape[:2])).transpose(1, 2).flatten(2, 3)
 
     def targets(

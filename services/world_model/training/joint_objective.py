@@ -1,10 +1,11 @@
 """Training losses: flow matching of video and tactile latents, and self-forcing.
 
 Self-forcing (Huang et al. 2025) trains on the model's own samples, as at deployment: contexts of
-half the batches are predicted, and noisy latents are those that the sampler reaches.
+half the batches are predicted, and noisy latents are those that the sampler reaches. Consistency
+training (Song and Dhariwal 2023) instead asks for the same end from all times of a path.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Literal
@@ -22,7 +23,9 @@ from services.world_model.dynamics.tensor_trees import combined, mapped
 from services.world_model.network.codecs import to_uint8
 from services.world_model.network.configuration import Precision
 from services.world_model.network.flow_matching import (
+    MIN_TIME,
     add_noise,
+    clean_from_velocity,
     implied_noise,
     sampling_times,
     training_times,
@@ -59,13 +62,16 @@ class LossOptions:
     `context_noise` is the relative deviation of noise on the first latents. Of tactile tokens count
     `touch_loss`: all, or those in contact or changing, as in the paper. `precision` is that of the
     experts' matrix products. With `own_noisy`, noisy latents are those of the model's own sampler.
-    `text_dropout` and `action_dropout` are shares of windows; the smaller one is without both.
+    With `consistency_steps`, the target is what the model itself predicts from the same path one
+    such step earlier, recorded latents at its end. `text_dropout` and `action_dropout` are shares
+    of windows; the smaller one is without both.
     """
 
     context_noise: float = 0.0
     touch_loss: TouchLoss = "all"
     precision: Precision = "float32"
     own_noisy: bool = False
+    consistency_steps: int | None = None
     text_dropout: float = 0.0
     action_dropout: float = 0.0
 
@@ -133,6 +139,11 @@ def examples_of(
         noise = combined([noisy, clean], lambda pair: implied_noise(pair[0], pair[1], t))
     else:
         noisy = combined([clean, noise], lambda pair: add_noise(pair[0], pair[1], t))
+    if options.consistency_steps is not None:
+        earlier = (t - 1.0 / options.consistency_steps).clamp_min(0.0)
+        with products_in(options.precision, device.type):
+            clean = own_ends(model, inputs, first, clean, noise, earlier)
+        noise = combined([noisy, clean], lambda pair: implied_noise(pair[0], pair[1], t))
     target = clean
     if model.config.prediction == "velocity":
         # Of the straight path from data to noise.
@@ -265,3 +276,25 @@ def own_noisy(
     noisy = model.sample(inputs, first, noise, sampling)
     times = sampling_times(num_steps, model.config.sampling_time_shift)
     return noisy, times[taken].expand(len(inputs)).to(noisy.video.device)
+
+
+@torch.no_grad()
+def own_ends(
+    model: JointWorldModel,
+    inputs: ModelInputs,
+    first: FirstLatents,
+    clean: JointLatents,
+    noise: JointLatents,
+    t: Float32[Tensor, " batch"],
+) -> JointLatents:
+    """Clean latents that the model predicts from straight paths at these times; given ones at 0."""
+    noisy = combined([clean, noise], lambda pair: add_noise(pair[0], pair[1], t))
+    guess = model(inputs, first, noisy, t.clamp_min(MIN_TIME))
+    if model.config.prediction == "velocity":
+        guess = combined([noisy, guess], lambda pair: clean_from_velocity(pair[0], pair[1], t))
+
+    def ends(pair: Sequence[Tensor]) -> Tensor:
+        is_end = (t == 0.0).view(-1, *[1] * (pair[0].ndim - 1))
+        return torch.where(is_end, pair[0], pair[1])
+
+    return combined([clean, guess], ends)

@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import astuple, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -42,8 +42,11 @@ from services.world_model.training.joint_objective import (
     examples_of,
     own_context,
 )
+from services.world_model.training.latent_cache import use_latent_cache
 from services.world_model.training.tokenizer_trainer import check_unseen, with_tokenizer
 
+# Chosen: four steps of a path at first, 128 at the end.
+_FIRST_CONSISTENCY_STEPS: Final = 4
 LOG_EVERY_STEPS = 20  # rows of a report's `log`, kept for resumed runs, too
 
 
@@ -269,7 +272,8 @@ class TrainingRun:
             windows.context_noise,
             settings.touch_loss,
             settings.precision,
-            own_noisy=self.settings.self_forcing,
+            own_noisy=self.settings.self_forcing and not self.settings.consistency,
+            consistency_steps=self._consistency_steps(),
             text_dropout=windows.text_dropout,
             action_dropout=windows.action_dropout,
         )
@@ -295,6 +299,12 @@ class TrainingRun:
         )
         video, tactile = self.processes.mean(both).tolist()
         return video, tactile
+
+    def _consistency_steps(self) -> int | None:
+        """Steps of the paths, which double five times: from low variance to low bias."""
+        if not self.settings.consistency:
+            return None
+        return _FIRST_CONSISTENCY_STEPS * 2 ** min(5, int(6 * self.budget.share()))
 
     def _batches(self) -> Iterator[joint_dataset.WindowBatch]:
         places = self._noted_places()
@@ -513,6 +523,8 @@ def _run_or_resume(
             )
     elif ancestor is None:
         run.fit_codecs(None if tokenizer is None else tokenizer.tokenizer)
+    # Images that the model itself drew come once only.
+    use_latent_cache(run.model, settings.wan, adds=not settings.self_forcing)
     kept_s = run.budget.wall_s
 
     def keep(now: TrainingRun) -> None:

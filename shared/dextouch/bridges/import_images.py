@@ -13,7 +13,7 @@ import numpy as np
 from av.video.frame import VideoFrame
 from av.video.reformatter import VideoReformatter
 
-from dextouch.episodes import GOP_IMAGES, MOST_STEPS, FrameNumbers, is_keyframe
+from dextouch.episodes import GOP_IMAGES, MOST_STEPS, FrameNumbers, parameter_sets
 from dextouch.errors import CorruptDataError, InvalidInputError, LimitExceededError
 from dextouch.images import jpeg_size
 from dextouch.streams import JPEG_UNIT
@@ -248,6 +248,7 @@ class Video:
     num_packets: int = 0
     num_before: int = 0
     in_groups: bool = True
+    parameters: bytes = b""
     first_packets: list[bytes] = field(default_factory=list)
 
     def add(self, data: bytes) -> None:
@@ -257,8 +258,11 @@ class Video:
         if self.size_px is None:
             self.num_before += 1
             return
-        begins = self.num_packets % GOP_IMAGES == 0
-        self.in_groups = self.in_groups and self.codec == "h264" and is_keyframe(data) == begins
+        if self.in_groups:
+            sets = parameter_sets(data) if self.codec == "h264" else b""
+            is_in_place = bool(sets) == (self.num_packets % GOP_IMAGES == 0)
+            is_same = sets in {b"", self.parameters} or video_size("h264", data) == self.size_px
+            self.in_groups, self.parameters = is_in_place and is_same, sets or self.parameters
         if self.num_packets < 4 * GOP_IMAGES:
             self.first_packets.append(data)
         self.num_packets += 1

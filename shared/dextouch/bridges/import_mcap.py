@@ -43,16 +43,7 @@ MAX_JSON_VALUES: Final = 1 << 20
 _MAX_NS: Final = (1 << 63) - 1
 _OF_EXPORTS: Final = (ABOUT, ATTRIBUTES_FILE)
 # What parsers of schemas raise for those that are not valid.
-_SCHEMA_ERRORS: Final = (
-    AttributeError,
-    KeyError,
-    IndexError,
-    NameError,
-    NotImplementedError,
-    RecursionError,
-    TypeError,
-    ValueError,
-)
+_SCHEMA_ERRORS = (AttributeError, LookupError, NameError, RuntimeError, TypeError, ValueError)
 Decoder = Callable[[bytes], Plain]
 
 
@@ -157,8 +148,11 @@ class _Readings:
                         self._survey.note_camera(channel.topic, camera_model(plain))
                     return
                 # Of an export of ours without its attachments; 0 in those of episodes.
-                number = int(plain.get(SEQUENCE) or reading.sequence)
-                reading = replace(reading, items=tuple(items_of(schema, plain)), sequence=number)
+                number = plain.get(SEQUENCE)
+                if not (isinstance(number, int) and 0 < number <= _MAX_NS):
+                    number = reading.sequence
+                items = tuple(items_of(schema, plain, is_typed=channel.message_encoding != "json"))
+                reading = replace(reading, items=items, sequence=number)
             except DexTouchError as error:
                 reason = error.message
         yield replace(reading, reason=reason) if reason else reading

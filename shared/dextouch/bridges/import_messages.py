@@ -75,7 +75,8 @@ class Form:
 
     def _identity(self) -> tuple[object, ...]:
         shape = self.shape[1:] if self.is_padded else self.shape
-        names = tuple(sorted(self.names)) if self.kind == "robot_state" else self.names
+        by_name = self.kind == "robot_state" and len({*self.names}) == len(self.names)
+        names = tuple(sorted(self.names)) if by_name else self.names
         return self.kind, self.unit, self.dtype, shape, self.frame, names
 
     def fit(self, values: np.ndarray, other: "Form") -> np.ndarray:
@@ -114,7 +115,7 @@ class CameraModel:
     more.
     """
 
-    frame: str
+    frame: str | None
     size_px: tuple[int, int]
     K: tuple[float, ...]
     distortion: tuple[float, ...]
@@ -127,8 +128,10 @@ def schema_name(name: str) -> str:
     return name.replace("/msg/", "/").replace("foxglove_msgs/", "foxglove.")
 
 
-def items_of(schema: str, message: Plain) -> list[Item]:
+def items_of(schema: str, message: Plain, *, is_typed: bool = True) -> list[Item]:
     """Samples of a message of a schema, by its `schema_name`.
+
+    Without `is_typed`, as of JSON, a number may be whole by chance.
 
     Raises:
         InvalidInputError: a message that this release cannot read, with the reason.
@@ -144,7 +147,8 @@ def items_of(schema: str, message: Plain) -> list[Item]:
         if schema.startswith("dextouch.") and "shape" in message:
             return [_our_array(schema, message)]
         ours = {T_DEVICE, SEQUENCE} & message.keys()
-        item = _flat({name: value for name, value in message.items() if name not in ours})
+        left = {name: value for name, value in message.items() if name not in ours}
+        item = _flat(left, is_typed=is_typed)
         return [replace(item, t_device_ns=_stamp_ns(message)) if ours else item]
     except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:
         raise CorruptDataError(
@@ -236,13 +240,16 @@ def _stamp_ns(message: Plain) -> int:
     """The message's own time; NO_DEVICE_TIME without one, and for 0, which means the same."""
     path = _stamp_path(message)
     if T_DEVICE in message:
-        return max(0, int(message[T_DEVICE])) or NO_DEVICE_TIME
-    if not path:
+        t_ns = int(message[T_DEVICE])
+    elif path:
+        stamp = message["header"]["stamp"] if path == "header.stamp." else message["timestamp"]
+        seconds = stamp.get("sec", stamp.get("seconds", 0))
+        nanos = stamp.get("nsec", stamp.get("nanosec", stamp.get("nanos", 0)))
+        # Some write the whole time as seconds.
+        whole_s = int(seconds)
+        t_ns = whole_s * _NS_PER_S + int(nanos) + round((float(seconds) - whole_s) * _NS_PER_S)
+    else:
         return NO_DEVICE_TIME
-    stamp = message["header"]["stamp"] if path == "header.stamp." else message["timestamp"]
-    seconds = stamp.get("sec", stamp.get("seconds", 0))
-    nanos = stamp.get("nsec", stamp.get("nanosec", stamp.get("nanos", 0)))
-    t_ns = int(seconds) * _NS_PER_S + int(nanos)
     return t_ns if 0 < t_ns <= _MAX_NS else NO_DEVICE_TIME
 
 
@@ -352,10 +359,8 @@ def _poses_message(message: Plain) -> list[Item]:
 
 def _point_cloud(types: tuple[str, ...], message: Plain) -> list[Item]:
     """Points with all their fields, padded with NaN to those of the largest cloud."""
-    data, stride = (
-        _bytes(message["data"]),
-        int(message.get("point_stride", message.get("point_step", 0))),
-    )
+    data = _bytes(message["data"])
+    stride = int(message.get("point_stride", message.get("point_step", 0)))
     fields = message["fields"]
     if not 1 <= len(fields) <= MAX_POINT_FIELDS or stride < 1:
         raise CorruptDataError(f"point cloud with {len(fields)} fields in {stride} bytes")
@@ -363,45 +368,37 @@ def _point_cloud(types: tuple[str, ...], message: Plain) -> list[Item]:
     names, formats, offsets = [], [], []
     for field in fields:
         number, count = int(field.get("type", field.get("datatype"))), int(field.get("count", 1))
-        if not 1 <= number < len(types) or count != 1:
-            raise InvalidInputError(f"point field {field.get('name')!r} of type {number}")
+        # PCL, too, takes the count 0 that some drivers write for 1.
+        if not 1 <= number < len(types) or count not in {0, 1}:
+            what = f"{count} numbers of type {number}"
+            raise InvalidInputError(f"point field {field.get('name')!r} of {what}, expected one")
         names.append(_text(field["name"]))
         formats.append((">" if big_endian else "<") + types[number])
         offsets.append(int(field["offset"]))
-    num_points = len(data) // stride
+    height, width, row_step = 1, len(data) // stride, len(data)
     if "point_step" in message:
         width, height = int(message["width"]), int(message["height"])
-        if int(message["row_step"]) != width * stride or len(data) < width * height * stride:
-            raise InvalidInputError(f"point cloud of {height} x {width} points with padded rows")
-        num_points = width * height
-    if num_points > MAX_POINTS:
-        raise LimitExceededError(f"{num_points} points, expected at most {MAX_POINTS}")
+        # Of a single row drivers write anything here.
+        row_step = int(message["row_step"]) if height > 1 else width * stride
+    row = width * stride
+    if width * height > MAX_POINTS:
+        raise LimitExceededError(f"{width * height} points, expected at most {MAX_POINTS}")
+    if min(width, height) < 0 or row_step < row or len(data) < (height - 1) * row_step + row:
+        raise CorruptDataError(f"{len(data)} bytes for {height} x {width} points")
     if any(
         o < 0 or o + np.dtype(f).itemsize > stride for o, f in zip(offsets, formats, strict=True)
     ):
         raise CorruptDataError("point cloud with a field beyond its points")
     wide = any(one[1:] in {"f8", "i4", "u4"} for one in formats)
     dtype = "float64" if wide else "float32"
-    record = np.dtype(
-        {
-            "names": [f"f{k}" for k in range(len(names))],
-            "formats": formats,
-            "offsets": offsets,
-            "itemsize": stride,
-        }
-    )
-    points = np.frombuffer(data, dtype=record, count=num_points)
-    values = np.stack([points[f].astype(dtype) for f in record.names or ()], axis=-1)
+    keys = [f"f{k}" for k in range(len(names))]
+    record = np.dtype({"names": keys, "formats": formats, "offsets": offsets, "itemsize": stride})
+    points = np.ndarray((height, width), record, data, strides=(row_step, stride)).ravel()
+    values = np.stack([points[key].astype(dtype) for key in keys], axis=-1)
     form = Form(
-        "scalar",
-        NUMBERS_UNIT,
-        dtype,
-        values.shape,
-        _frame(message),
-        tuple(names),
-        is_padded=True,
-        as_numbers="points",
-    )
+        "scalar", NUMBERS_UNIT, dtype, values.shape, _frame(message), tuple(names),
+        is_padded=True, as_numbers="points",
+    )  # fmt: skip
     if (pose := message.get("pose")) is not None and (moved := _moved(pose)) != _moved({}):
         form = replace(form, notes=(f"pose of the points in their frame left out: {moved}",))
     return [_array_item(message, form, values)]
@@ -481,7 +478,7 @@ def _array(message: Plain, values: np.ndarray, shape: tuple[int, ...], dtype: st
     return _array_item(message, form, values)
 
 
-def _flat(message: Plain) -> Item:
+def _flat(message: Plain, *, is_typed: bool) -> Item:
     """All numbers of a message, in its order, with their paths as names."""
     paths: list[tuple[str, int]] = []
     numbers: list[np.ndarray] = []
@@ -494,10 +491,10 @@ def _flat(message: Plain) -> Item:
             continue
         if isinstance(value, np.ndarray):
             paths.append((path, value.size if value.ndim else -1))
-            numbers.append(value.ravel().astype(np.float64))
+            numbers.append(value.ravel())
             size += value.size
-            is_whole = value.dtype.kind in "iu" and value.size
-            if is_whole and max(-int(value.min()), int(value.max())) > _MAX_EXACT:
+            has_whole = value.dtype.kind in "iu" and value.size
+            if has_whole and max(-int(value.min()), int(value.max())) > _MAX_EXACT:
                 rounded.append(path)
         elif value not in {None, ""} and path not in {"frame_id", "header.frame_id"}:
             skipped.append(path)
@@ -505,18 +502,16 @@ def _flat(message: Plain) -> Item:
             raise LimitExceededError(f"message of more than {MAX_NUMBERS} values")
     if not size:
         raise InvalidInputError("message without a number")
-    said = {"left out, not numbers": skipped, "above 2^53, rounded": rounded}
+    values = np.concatenate([one for one in numbers if one.size])
+    is_whole = is_typed and np.can_cast(values.dtype, np.int64)
+    dtype = "int64" if is_whole else "float64"
+    said = {"left out, not numbers": skipped, "above 2^53, rounded": [] if is_whole else rounded}
     form = Form(
-        "scalar",
-        NUMBERS_UNIT,
-        "float64",
-        (size,),
-        _frame(message),
-        _names(tuple(paths)),
+        "scalar", NUMBERS_UNIT, dtype, (size,), _frame(message), _names(tuple(paths)),
         as_numbers="no schema that this release knows",
         notes=tuple(f"{what}: {', '.join(which[:8])}" for what, which in said.items() if which),
-    )
-    return _array_item(message, form, np.concatenate(numbers))
+    )  # fmt: skip
+    return _array_item(message, form, values)
 
 
 @lru_cache(maxsize=64)

@@ -14,6 +14,7 @@ from pydantic import ValidationError
 from dextouch import __version__
 from dextouch.bridges.export_files import Block
 from dextouch.bridges.formats import FILE_SIGNATURES
+from dextouch.data_folder import is_system_file
 from dextouch.episodes import EpisodeStore, EpisodeWriter, disk_errors
 from dextouch.errors import ConflictError, InvalidInputError, UnknownNameError
 from dextouch.schemas import Domain, ImportedFile, RecordingAttributes, first_problems
@@ -30,6 +31,13 @@ _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 # Host times before are those of a clock that counts from its start, not from 1970.
 _EARLIEST_NS: Final = int(datetime(2000, 1, 1, tzinfo=UTC).timestamp()) * _NS_PER_S
 _LATEST_NS: Final = int(datetime(2200, 1, 1, tzinfo=UTC).timestamp()) * _NS_PER_S
+# What to do with files of other kinds that come in the place of a recording.
+_OTHER_FILES: Final = {
+    b"version https://git-lfs": "it is a pointer of Git LFS, `git lfs pull` gets the file",
+    b"#ROSBAG": "it is a ROS 1 bag, convert it with `rosbags-convert --dst-storage mcap`",
+    b"SQLite": "if it is of a ROS 2 bag, convert it with `rosbags-convert --dst-storage mcap`",
+    b"\x28\xb5\x2f\xfd": "it is compressed, unpack it with `zstd -d`",
+}
 
 
 @dataclass(frozen=True)
@@ -172,10 +180,11 @@ def find_format(path: Path) -> str:
 
     Raises InvalidInputError if it is none of these.
     """
+    expected = "expected an MCAP file, a Rerun .rrd file, or a LeRobot data set"
     if path.is_dir():
         if (path / "meta" / "info.json").is_file():
             return "lerobot"
-        forms = [form for form in FILE_SIGNATURES if any(path.glob(f"*.{form}"))]
+        forms = [form for form in FILE_SIGNATURES if files_of(path, form)]
         if len(forms) == 1:
             return forms[0]
         if forms:
@@ -188,9 +197,23 @@ def find_format(path: Path) -> str:
             if start.startswith(signature):
                 return form
         found = f"a file that begins with {start.hex(' ') or 'nothing'}"
-    raise InvalidInputError(
-        f"{path}: got {found}, expected an MCAP file, a Rerun .rrd file, or a LeRobot data set"
-    )
+        expected = remedy(path, expected)
+    raise InvalidInputError(f"{path}: got {found}; {expected}")
+
+
+def files_of(folder: Path, form: str) -> list[Path]:
+    """Files of a format in a folder, by their names and without those of operating systems."""
+    with disk_errors(f"read {folder}"):
+        found = [path for path in folder.iterdir() if path.suffix.lower() == f".{form}"]
+    return sorted(path for path in found if not is_system_file(path.name))
+
+
+def remedy(path: Path, usual: str = "copy the dataset again") -> str:
+    """What to do with a file that is not what it should be, by its first bytes."""
+    with disk_errors(f"read {path}"), path.open("rb") as file:
+        start = file.read(32)
+    found = (advice for signature, advice in _OTHER_FILES.items() if start.startswith(signature))
+    return next(found, usual)
 
 
 def stream_names(sources: Sequence[str], mapping: Mapping[str, str]) -> dict[str, str]:

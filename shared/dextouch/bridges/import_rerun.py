@@ -26,7 +26,7 @@ from dextouch.bridges.import_messages import (
     encoded_image,
     raw_image,
 )
-from dextouch.bridges.import_recording import ImportAttributes, ImportReport
+from dextouch.bridges.import_recording import ImportAttributes, ImportReport, Refused
 from dextouch.bridges.import_streams import Reading, Survey, import_readings
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import (
@@ -55,12 +55,7 @@ _ENCODINGS: Final = {
     (0, 34): "32FC1",
 }
 # rerun.components.VideoCodec are the four-character codes of MP4.
-_VIDEO_CODECS: Final = {
-    0x61766331: "h264",
-    0x68657631: "h265",
-    0x76703039: "vp9",
-    0x61763031: "av1",
-}
+_VIDEO_CODECS = {0x61766331: "h264", 0x68657631: "h265", 0x76703039: "vp9", 0x61763031: "av1"}
 _CHILD_FROM_PARENT: Final = 2
 _ROW_ID: Final = "rerun.controls.RowId"
 # Values that are remembered of entities whose rows leave some out.
@@ -112,10 +107,13 @@ def import_rrd(
     """
     if not path.is_file():
         raise NotFoundError(f"{path}: no such file; expected a Rerun .rrd file")
-    chosen = _timeline(path, timeline)
-    return import_readings(
+    chosen, others = _timeline(path, timeline)
+    report = import_readings(
         path, store, about, lambda survey: _Rows(path, chosen, survey).run(), form="rrd"
     )
+    reason = f"left out; times are of {chosen!r}, when the samples were logged"
+    report.refused += [Refused(other[:256], reason, "timeline") for other in others]
+    return report
 
 
 def _chunks(path: Path) -> Iterator[Chunk]:
@@ -137,7 +135,8 @@ def _opened(path: Path) -> tuple[RrdReader, list[str]]:
             raise CorruptDataError(f"{path}: rerun-sdk cannot read it ({error})") from error
 
 
-def _timeline(path: Path, name: str | None) -> str:
+def _timeline(path: Path, name: str | None) -> tuple[str, list[str]]:
+    """The timeline, and those without times of a file that has no other with times of its own."""
     found: dict[str, bool] = {}
     for chunk in _chunks(path):
         if not chunk.is_static:
@@ -146,10 +145,12 @@ def _timeline(path: Path, name: str | None) -> str:
                 found[one] = not arrow_types.is_integer(schema.field(one).type)
     timed = [one for one, is_time in found.items() if is_time]
     own = [one for one in timed if one not in _OF_LOGGING] or timed
-    if name is None and len(own) == 1:
-        return own[0]
-    if name in timed:
-        return str(name)
+    if not found:
+        raise InvalidInputError(f"{path}: holds nothing that was logged at a time")
+    chosen = own[0] if name is None and len(own) == 1 else name
+    if chosen in timed:
+        others = sorted({*found} - {*_OF_LOGGING}) if chosen in _OF_LOGGING else []
+        return str(chosen), others
     got = "none is given" if name is None else f"{name!r} is not one of them"
     raise InvalidInputError(
         f"{path}: has the timelines {sorted(found)}, of which {sorted(timed)} are times, and "
@@ -335,8 +336,8 @@ def _moment(t_ns: int, row_id: bytes) -> int:
 
 def _plain(value: Any) -> Any:  # noqa: ANN401 - of pyarrow
     """A component without the memory of its chunk: numbers, or the dictionary of a structure."""
-    if len(value) and arrow_types.is_struct(value.values.type):
-        return value[0].as_py()
+    if arrow_types.is_struct(value.values.type):
+        return value[0].as_py() if len(value) else {}
     return _flat(value)[:16].astype(np.float64)
 
 
@@ -469,12 +470,16 @@ def _numbers(row: Row, known: Known, frame: str | None) -> Iterator[Item]:
             arrow_types.is_floating(value.values.type) or arrow_types.is_integer(value.values.type)
         ):
             raise InvalidInputError(f"component {name}, which this release does not read")
-        numbers = _flat(value).astype("<f8")
+        numbers = _flat(value)
+        if numbers.dtype == np.uint64 and numbers.max() > np.iinfo(np.int64).max:
+            raise InvalidInputError(f"component {name}: numbers above 2^63, which no stream can")
+        numbers = numbers.astype("<i8" if numbers.dtype.kind in "iu" else "<f8")
         if len(numbers) > MAX_POINTS:
             raise InvalidInputError(f"{len(numbers)} numbers, expected at most {MAX_POINTS}")
         is_scalars = _archetype(name) == "Scalars"
         said = "" if is_scalars else f"component {name}"
-        form = Form("scalar", NUMBERS_UNIT, "float64", numbers.shape, frame, as_numbers=said)
+        dtype = numbers.dtype.name
+        form = Form("scalar", NUMBERS_UNIT, dtype, numbers.shape, frame, as_numbers=said)
         yield _item(form, numbers.copy, "Scalars" if is_scalars else name)
 
 
@@ -486,7 +491,7 @@ def _pinhole(known: Known) -> CameraModel | None:
     width_px, height_px = (int(one) for one in size)
     check_pixels(height_px, width_px)
     K = K.reshape(3, 3).T.ravel()
-    return CameraModel("", (height_px, width_px), tuple(K.tolist()), (0.0,) * 5)
+    return CameraModel(None, (height_px, width_px), tuple(K.tolist()), (0.0,) * 5)
 
 
 _READERS: Final[Mapping[str, Callable[[Row, Known, str | None], Iterator[Item]]]] = {

@@ -200,6 +200,8 @@ class _Part:
         if form.is_padded:
             sample_bytes = math.prod(form.shape) * np.dtype(form.dtype).itemsize
             self.num_bytes = len(self.times) * sample_bytes
+        if 0 in form.shape:
+            raise InvalidInputError(f"samples without a number, {form.describe()}")
         if not self.is_ordered and (self.video or self.num_bytes > MAX_HELD_BYTES):
             raise LimitExceededError(
                 "times go back, and there is too much to sort (or a video): sort the file by "
@@ -482,7 +484,10 @@ def _calibration(
         near = _seen_by(source, model, images, list(survey.cameras))
         near = [one for one in near if one.descriptor.shape[:2] == model.size_px]
         if not near:
-            reason = f"no images of {model.size_px} pixels in frame {model.frame!r} or beside it"
+            place = (
+                f"in frame {model.frame!r} or beside" if model.frame is not None else "at or below"
+            )
+            reason = f"no images of {model.size_px} pixels {place} it"
             refused.append(Refused(source, reason, "calibration", count))
         for stream in near:
             camera = stream.descriptor.name.removeprefix("camera_")
@@ -502,16 +507,18 @@ def _calibration(
 def _seen_by(
     source: str, model: CameraModel, images: list[ForeignStream], calibrations: list[str]
 ) -> list[ForeignStream]:
-    """Images in the calibration's frame; else at or below its name; else the ones beside it."""
+    """Images in the calibration's frame; else at or below its name; else the ones beside it.
+
+    Those of Rerun, without a frame, are of what is at or below their entity only.
+    """
     folder = source.rpartition("/")[0]
     if in_frame := [one for one in images if model.frame and one.descriptor.frame == model.frame]:
         beside = [one for one in in_frame if f"{one.source}/".startswith(f"{folder}/")]
         return beside or in_frame
     if below := [one for one in images if f"{one.source}/".startswith(f"{source}/")]:
         return below
-    if len(calibrations) > 1 and (
-        not folder or sum(one.rpartition("/")[0] == folder for one in calibrations) > 1
-    ):
+    num_beside = sum(one.rpartition("/")[0] == folder for one in calibrations)
+    if model.frame is None or (len(calibrations) > 1 and (not folder or num_beside > 1)):
         return []
     return [one for one in images if one.source.startswith(f"{folder}/")]
 

@@ -154,13 +154,8 @@ class _Export:
         sources = [self._messages(*one) for one in enumerate(channels)]
         num_messages = self._write_calibrations()
         for log_time, order, publish_time, sequence, data in heapq.merge(*sources):
-            self._writer.add_message(
-                channel_id=self._channel_ids[order],
-                log_time=log_time,
-                publish_time=publish_time,
-                sequence=sequence,
-                data=data,
-            )
+            channel = self._channel_ids[order]
+            self._writer.add_message(channel, log_time, data, publish_time, sequence)
             num_messages += 1
         finish: Callable[[], None] = self._writer.finish
         finish()
@@ -466,7 +461,9 @@ def records(path: Path) -> Iterator[McapRecord]:
         try:
             yield from _records(file, path)
         except EOFError as error:
-            raise CorruptDataError(f"{path}: is truncated ({error}); copy it again") from error
+            raise CorruptDataError(
+                f"{path}: is truncated ({error}); copy it again, or see what `mcap recover` saves"
+            ) from error
         except (McapError, ValueError, KeyError, struct.error, zstandard.ZstdError) as error:
             raise CorruptDataError(
                 f"{path}: is damaged or truncated before byte {file.tell()} "

@@ -63,7 +63,9 @@ from .splits import scene_of as scene_of
 from .splits import split_by_scene as split_by_scene
 from .splits import split_of as split_of
 from .splits import split_of_scene as split_of_scene
+from .staging import CATALOG_FOLDER as CATALOG_FOLDER
 from .staging import DOWNLOADS as DOWNLOADS
+from .staging import remove_catalog as remove_catalog
 from .store import EpisodeStore as EpisodeStore
 from .store import local_folder as local_folder
 from .table import TRUE_ORIGINS as TRUE_ORIGINS

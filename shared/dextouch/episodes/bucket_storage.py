@@ -12,7 +12,7 @@ import threading
 import uuid
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, nullcontext, suppress
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -59,6 +59,8 @@ TAIL_BYTES = 1 << 16
 MAX_READ_AHEAD = 8
 _TAIL = -1
 CLAIM_FILE = "claim"
+# An empty object of each change, which catalogs list instead of all items.
+CHANGES = ".changes"
 # A hash that no content has, so that nothing is written while a group is deleted.
 _DELETING = b"deleting"
 # Uploads older than this count as abandoned.
@@ -243,9 +245,11 @@ class ObjectStorage:
 
     def num_bytes(self, kind: Kind, item_id: str) -> int:
         """Size of a committed group in the bucket."""
-        if not self.exists(kind, item_id):
+        group = group_key(kind, item_id)
+        sizes = {facts.key: facts.size for facts in self._bucket.list(group)}
+        if f"{group}/{COMMIT_FILE}" not in sizes:
             raise self._missing(kind, item_id)
-        return sum(facts.size for facts in self._bucket.list(group_key(kind, item_id)))
+        return sum(sizes.values())
 
     def list(self, kind: Kind) -> list[str]:
         """Sorted committed ids; takes one request per 1000 objects in the bucket."""
@@ -255,6 +259,16 @@ class ObjectStorage:
     def folder_numbers(self, kind: Kind) -> dict[str, int]:
         """Ids of a kind; takes one request per 1000 of them."""
         return dict.fromkeys(self._bucket.folders(f"{kind}s"), 0)
+
+    def changes(self) -> dict[str, tuple[Kind, str]]:
+        """See `EpisodeStore.changes`; takes one request per 1000 changes."""
+        found = (facts.key.split("/") for facts in _announced(self._bucket))
+        return {
+            parts[3]: (kind, parts[2])
+            for parts in found
+            for kind in KINDS
+            if len(parts) == 4 and parts[1] == f"{kind}s"
+        }
 
     def fingerprints(self, kind: Kind, numbers: Mapping[str, int]) -> dict[str, GroupFingerprint]:
         """Entity tags of what a catalog is made of: of few ids one by one, of many from a list."""
@@ -279,6 +293,7 @@ class ObjectStorage:
         group = group_key(kind, item_id)
         self._bucket.put(f"{group}/{CLAIM_FILE}", _DELETING)
         self._bucket.remove([f"{group}/{COMMIT_FILE}"])
+        _announce(self._bucket, group)
         _remove_files(self._bucket, group, [facts.key for facts in self._bucket.list(group)])
 
     def set_remark(self, kind: Kind, item_id: str, name: str, content: bytes | None) -> None:
@@ -288,6 +303,7 @@ class ObjectStorage:
             self._bucket.remove([key])
         else:
             self._bucket.put(key, content)
+        _announce(self._bucket, group_key(kind, item_id))
 
     def get_file(self, name: str) -> bytes | None:
         """An object beside the groups; None if it does not exist."""
@@ -403,6 +419,8 @@ def upload_group(bucket: Bucket, kind: Kind, folder: Path) -> None:
         _claim(bucket, group, content, name)
         if not bucket.put(f"{group}/{COMMIT_FILE}", commit, create=True):
             _is_committed(bucket, group, content, name)
+    # Also after a kill between both: what is still here is uploaded again.
+    _announce(bucket, group)
     with disk_errors(f"remove what was uploaded of {name}"):
         # First, so that the remainder after a kill does not pass for a group.
         (folder / COMMIT_FILE).unlink()
@@ -412,7 +430,8 @@ def upload_group(bucket: Bucket, kind: Kind, folder: Path) -> None:
 def sweep_orphans(bucket: Bucket, *, now: datetime | None = None) -> int:
     """Remove objects of abandoned uploads and deletions, and return the number of groups.
 
-    The whole bucket is listed. ORPHAN_AGE counts back from `now`, the present by default.
+    The whole bucket is listed. ORPHAN_AGE counts back from `now`, the present by default. Changes
+    of that age are removed, too, except the last one.
     """
     limit = (datetime.now(UTC) if now is None else now) - ORPHAN_AGE
     removed = 0
@@ -430,7 +449,23 @@ def sweep_orphans(bucket: Bucket, *, now: datetime | None = None) -> int:
             if bucket.head(f"{group}/{COMMIT_FILE}") is None:
                 _remove_files(bucket, group, keys)
                 removed += 1
+    changes = sorted(_announced(bucket), key=lambda facts: facts.modified)
+    bucket.remove([facts.key for facts in changes[:-1] if facts.modified < limit])
     return removed
+
+
+def _announce(bucket: Bucket, group: str) -> None:
+    """Tell catalogs that a group was changed; without the permission they find it by its id."""
+    try:
+        bucket.put(f"{CHANGES}/{group}/{uuid.uuid4().hex}", b"")
+    except StorageError as error:
+        logger.warning("change_not_announced", group=group, reason=error.message)
+
+
+def _announced(bucket: Bucket) -> builtins.list[ObjectFacts]:
+    with suppress(StorageError):
+        return builtins.list(bucket.list(CHANGES))
+    return []
 
 
 def _claim(bucket: Bucket, group: str, content: str, name: str) -> None:

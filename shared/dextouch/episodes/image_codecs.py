@@ -20,6 +20,7 @@ from itertools import accumulate, pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from jaxtyping import UInt8
 from pydantic import Field
 
 from dextouch.episodes.format import GOP_IMAGES, GROUP_IMAGES, ImageCodec
@@ -294,10 +295,16 @@ def decoder_of_this_thread(height: int, width: int) -> GopDecoder:
     return known[height, width]
 
 
-def check_group(access_units: Sequence[bytes], size_px: tuple[int, int]) -> None:
-    """Decode a group of pictures, or its first images, and discard them; raises as `frames`."""
-    for _ in decoder_of_this_thread(*size_px).frames(access_units):
-        pass
+def check_group(
+    access_units: Sequence[bytes], size_px: tuple[int, int]
+) -> list[UInt8[np.ndarray, "h w 1"]]:
+    """Decode a group of pictures, or its first images, to their luma; raises as `frames`."""
+    height, width = size_px
+    planes = (f.planes[0] for f in decoder_of_this_thread(height, width).frames(access_units))
+    return [
+        np.frombuffer(memoryview(p), np.uint8).reshape(-1, p.line_size)[:height, :width, None]
+        for p in planes
+    ]
 
 
 def pack_group(codec: ImageCodec, images: Sequence[bytes]) -> bytes:

@@ -1,4 +1,4 @@
-"""Stages, the folders of unfinished items: made, swept after a kill, and renamed on commit."""
+"""Folders of a store beside its items: stages, swept after a kill, downloads, the catalog."""
 
 import errno
 import shutil
@@ -35,6 +35,16 @@ from dextouch.schemas import json_ready
 STAGING = ".staging"
 # Folders of running downloads, each with the ids of its items.
 DOWNLOADS = ".downloads"
+# Databases of the tables of `services.episode_store`; any other file there is removed as a whole,
+# since the catalog is made anew from the items.
+CATALOG_FOLDER = ".catalog"
+JOURNALS = ("-wal", "-shm", "-journal")
+
+
+def remove_catalog(path: Path) -> None:
+    """Remove a database with its journals; processes that have it open do not notice."""
+    for suffix in ("", *JOURNALS):
+        path.with_name(path.name + suffix).unlink(missing_ok=True)
 
 
 def new_stage(root: Path, kind: Kind, item_id: str) -> Path:

@@ -175,6 +175,14 @@ class EpisodeStore:
         """
         return self._storage.folder_numbers(_check_kind(kind))
 
+    def changes(self) -> Mapping[str, tuple[Kind, str]]:
+        """Kinds and ids of items that were changed lately in a bucket, by names of the changes.
+
+        A change is announced when everybody sees it, and kept for a day, the last one for longer.
+        None in a folder, and in a bucket that only earlier releases have changed.
+        """
+        return {} if isinstance(self._storage, _LocalStorage) else self._storage.changes()
+
     def fingerprints(
         self, numbers: Mapping[str, int], *, kind: Kind = "episode"
     ) -> dict[str, GroupFingerprint]:
@@ -462,8 +470,10 @@ class _LocalStorage:
                     content = f"{commit} {_stamp(folder + METADATA_FILE)}"
                     # Most have none, and raising errors would take as long as all the rest.
                     remarks = none
-                    if any(os.access(folder + file, os.F_OK) for file in REMARK_FILES):
-                        remarks = " ".join(_stamp(folder + file) for file in REMARK_FILES)
+                    for file in REMARK_FILES:
+                        if os.access(folder + file, os.F_OK):
+                            remarks = " ".join(_stamp(folder + one) for one in REMARK_FILES)
+                            break
                 except PermissionError:
                     # Reading it says what is wrong.
                     commit, content, remarks = "?", "? ", none

@@ -81,14 +81,19 @@ def action_names(*, has_robot_joints: bool = True) -> list[str]:
     return [*left, *right, *joints, *head]
 
 
+def all_finite(array: np.ndarray) -> bool:
+    """Whether no number is NaN or infinite."""
+    # A byte of it is 0 or 1; for the small arrays of a chunk `all` takes three times as long.
+    return 0 not in np.isfinite(array).tobytes()
+
+
 def check_actions(actions: np.ndarray, *, where: str = "actions") -> Float64[np.ndarray, "time 67"]:
     """Actions as float64 [T ≥ 1, 67]; raises ShapeError, or NonFiniteError with the place."""
     checked = np.asarray(actions, dtype=np.float64)
     if checked.ndim != 2 or checked.shape[1] != ACTION_DIM or len(checked) == 0:
         raise ShapeError(f"{where}: got shape {checked.shape}, expected [T ≥ 1, {ACTION_DIM}]")
-    is_finite = np.isfinite(checked)
-    if not is_finite.all():
-        bad = np.argwhere(~is_finite)
+    if not all_finite(checked):
+        bad = np.argwhere(~np.isfinite(checked))
         row, column = bad[0]
         raise NonFiniteError(
             f"{where}: {len(bad)} values are NaN or infinite, first in row {row}, column {column}; "

@@ -23,6 +23,7 @@ from .guard import OCTETS as OCTETS
 from .guard import JsonBody as JsonBody
 from .guard import RequireScope as RequireScope
 from .guard import decoded as decoded
+from .guard import header as header
 from .guard import media_type as media_type
 from .guard import takes as takes
 from .keys import AccessControl as AccessControl

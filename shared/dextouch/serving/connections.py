@@ -5,10 +5,10 @@ Every response has a request id and a Server-Timing header; `timed` adds parts t
 """
 
 import asyncio
+import os
 import re
-import secrets
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import cache, cached_property, partial
@@ -169,7 +169,9 @@ class _LimitedWebSocket(_Watched, WebSocketsSansIOProtocol):
     def data_received(self, data: bytes) -> None:
         super().data_received(data)
         buffered = len(self.conn.reader.buffer)
-        unfinished = buffered + len(self._begun) + sum(len(frame) for frame in self.frames)
+        unfinished = buffered + len(self._begun) + sum(map(len, self.frames))
+        if unfinished == self._unfinished_bytes:
+            return
         # Only what is of a message counts: pings could be sent for ever.
         if not self.transport.get_write_buffer_size():
             self._moved_bytes += max(0, unfinished - self._unfinished_bytes)
@@ -282,16 +284,16 @@ class _LimitedHttp(_Watched, HttpToolsProtocol):
         self._moved_bytes += len(data)
         super().data_received(data)
         # The parser keeps a header to itself until its end.
-        if self._is_receiving and not self._is_refused:
+        too_many = self._received_bytes > MAX_HEADER_BYTES
+        if too_many and self._is_receiving and not self._is_refused:
             with suppress(HttpParserError):
-                self._check_headers(self._received_bytes)
+                self._refuse_headers(self._received_bytes)
 
-    def _check_headers(self, num_bytes: int) -> None:
+    def _refuse_headers(self, num_bytes: int) -> None:
         """Refuse a request with too many bytes beside its body; the error ends its parsing."""
-        if num_bytes > MAX_HEADER_BYTES:
-            text = f"got {num_bytes} bytes of headers, expected at most {MAX_HEADER_BYTES}"
-            self._refuse(431, InvalidInputError(text))
-            raise HttpParserError(text)
+        text = f"got {num_bytes} bytes of headers, expected at most {MAX_HEADER_BYTES}"
+        self._refuse(431, InvalidInputError(text))
+        raise HttpParserError(text)
 
     def on_message_begin(self) -> None:
         super().on_message_begin()
@@ -300,12 +302,14 @@ class _LimitedHttp(_Watched, HttpToolsProtocol):
 
     def on_url(self, url: bytes) -> None:
         self._header_bytes += len(url)
-        self._check_headers(self._header_bytes)
+        if self._header_bytes > MAX_HEADER_BYTES:
+            self._refuse_headers(self._header_bytes)
         super().on_url(url)
 
     def on_header(self, name: bytes, value: bytes) -> None:
         self._header_bytes += len(name) + len(value) + NUM_SEPARATORS
-        self._check_headers(self._header_bytes)
+        if self._header_bytes > MAX_HEADER_BYTES:
+            self._refuse_headers(self._header_bytes)
         super().on_header(name, value)
 
     def on_headers_complete(self) -> None:
@@ -322,7 +326,7 @@ class _LimitedHttp(_Watched, HttpToolsProtocol):
         self._is_receiving = False
 
     def send_400_response(self, msg: str) -> None:
-        # Also called where `_check_headers` has answered.
+        # Also called where `_refuse_headers` has answered.
         if self._is_refused:
             return
         self._note_refusal(400, "no valid HTTP")
@@ -482,22 +486,19 @@ class RequestMiddleware:
             return
         started = time.perf_counter()
         given = header(scope, b"x-request-id") or ""
-        is_usable = REQUEST_ID.fullmatch(given) and masked(given) == given
-        request_id = given if is_usable else secrets.token_hex(16)
+        is_usable = given and REQUEST_ID.fullmatch(given) and masked(given) == given
+        request_id = given if is_usable else os.urandom(16).hex()
         timings_s: dict[str, float] = {}
         scope.setdefault("state", {}).update(request_id=request_id, timings_s=timings_s)
 
-        async def send_with_headers(message: Message) -> None:
+        def send_with_headers(message: Message) -> Awaitable[None]:
             if message["type"] == "http.response.start":
                 duration_s = time.perf_counter() - started
                 timings = [f"{part};dur={spent_s * 1e3:.2f}" for part, spent_s in timings_s.items()]
                 timings.append(f"total;dur={duration_s * 1e3:.2f}")
+                headers = [one for one in message.get("headers", ()) if one[0] not in OWN_HEADERS]
                 message["headers"] = [
-                    *(
-                        header
-                        for header in message.get("headers", ())
-                        if header[0] not in OWN_HEADERS
-                    ),
+                    *headers,
                     (b"x-request-id", request_id.encode()),
                     (b"server-timing", ", ".join(timings).encode()),
                 ]
@@ -508,12 +509,12 @@ class RequestMiddleware:
                 self._uncounted.add(
                     (scope["method"], route, message["status"], duration_s, parts_s)
                 )
-            await send(message)
+            return send(message)
 
-        with traced(scope) as trace_id:
-            scope["state"]["trace_id"] = trace_id
+        with traced(scope) as span:
+            scope["state"]["trace_id"] = span.trace_id
             tokens = structlog.contextvars.bind_contextvars(
-                request_id=request_id, trace_id=trace_id
+                request_id=request_id, trace_id=span.trace_id
             )
             try:
                 await self._app(scope, receive, send_with_headers)
@@ -523,11 +524,11 @@ class RequestMiddleware:
     async def _count_websocket(self, scope: Scope, receive: Receive, send: Send) -> None:
         opened: list[Gauge] = []
 
-        async def send_and_count(message: Message) -> None:
+        def send_and_count(message: Message) -> Awaitable[None]:
             if message["type"] == "websocket.accept":
                 opened.append(self._websockets.labels(scope["route"].path))
                 opened[0].inc()
-            await send(message)
+            return send(message)
 
         try:
             await self._app(scope, receive, send_and_count)

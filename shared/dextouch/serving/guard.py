@@ -36,6 +36,8 @@ HOST = re.compile(r"(?:\[([0-9a-f:.]+)\]|([a-z0-9_.-]+))(?::\d{1,5})?")
 SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS"})
 # By which a page of another site is recognised.
 SENDER_HEADERS = (b"host", b"origin", b"sec-fetch-site")
+# Of a scope: the headers by name, which are looked up several times.
+FIRST_HEADERS = "dextouch.first_headers"
 # Health checks and Prometheus have no key, and use container names as host.
 PROBES = frozenset({"/healthz", "/readyz", "/metrics"})
 POLICY_VIOLATION = 1008
@@ -58,10 +60,11 @@ Refuse = Callable[[Request, DexTouchError | HTTPException], Response]
 
 def header(scope: Scope, name: bytes) -> str | None:
     """First header of a lower-case name, as `starlette.datastructures.Headers.get`, but quicker."""
-    for key, value in scope["headers"]:
-        if key == name:
-            return str(value, "latin-1")
-    return None
+    found = scope.get(FIRST_HEADERS)
+    if found is None:
+        found = scope[FIRST_HEADERS] = dict(scope["headers"][::-1])
+    value = found.get(name)
+    return None if value is None else str(value, "latin-1")
 
 
 @dataclass(frozen=True)
@@ -71,29 +74,21 @@ class SitePolicy:
     hosts: Sequence[str]
     origins: Sequence[str]
 
-    def check(self, connection: HTTPConnection, *, is_unsafe: bool) -> None:
+    def check(self, scope: Scope, *, is_unsafe: bool) -> None:
         """Refuse pages of other sites; unsafe is what may change state, or opens a WebSocket."""
-        sent: dict[bytes, list[str]] = {}
-        for name, value in connection.scope["headers"]:
-            if name in SENDER_HEADERS:
-                sent.setdefault(name, []).append(value.decode("latin-1").lower())
-        hosts, origins, sites = (tuple(sent.get(name, ())) for name in SENDER_HEADERS)
-        self._check_once(connection.scope["scheme"], hosts, origins, sites[:1], is_unsafe=is_unsafe)
+        sent = tuple([(name, one) for name, one in scope["headers"] if name in SENDER_HEADERS])
+        self._check_once(scope["scheme"], sent, is_unsafe=is_unsafe)
 
     @cached_property
     def _check_once(self) -> Callable[..., None]:
         """As `_check`, for senders that it has just admitted without another look."""
         return lru_cache(maxsize=64)(self._check)
 
-    def _check(
-        self,
-        scheme: str,
-        hosts: Sequence[str],
-        origins: Sequence[str],
-        sites: Sequence[str],
-        *,
-        is_unsafe: bool,
-    ) -> None:
+    def _check(self, scheme: str, sent: Sequence[tuple[bytes, bytes]], *, is_unsafe: bool) -> None:
+        hosts, origins, sites = (
+            [value.decode("latin-1").lower() for name, value in sent if name == wanted]
+            for wanted in SENDER_HEADERS
+        )
         host = ", ".join(hosts)
         self._check_host(host)
         if not is_unsafe:
@@ -288,17 +283,16 @@ class GuardMiddleware:
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Handle one request or WebSocket."""
         if scope["type"] == "http":
-            request, rule = Request(scope), self.bodies.rule_of(scope)
-            is_unsafe = scope["method"] not in SAFE_METHODS
+            rule, is_unsafe = self.bodies.rule_of(scope), scope["method"] not in SAFE_METHODS
             try:
-                self._check_sender(request, needs_key=rule.needs_key, is_unsafe=is_unsafe)
+                self._check_sender(scope, needs_key=rule.needs_key, is_unsafe=is_unsafe)
                 receive = self.bodies.limited(receive, scope, rule)
             except (DexTouchError, HTTPException) as error:
-                await self.refuse(request, error)(scope, receive, send)
+                await self.refuse(Request(scope), error)(scope, receive, send)
                 return
         elif scope["type"] == "websocket":
             try:
-                self._check_sender(HTTPConnection(scope), needs_key=True, is_unsafe=True)
+                self._check_sender(scope, needs_key=True, is_unsafe=True)
             except AccessDeniedError as error:
                 await self._refuse_websocket(error, scope, receive, send)
                 return
@@ -318,14 +312,13 @@ class GuardMiddleware:
         reason = error.message.encode()[:MAX_REASON_BYTES].decode(errors="ignore")
         await send({"type": "websocket.close", "code": POLICY_VIOLATION, "reason": reason})
 
-    def _check_sender(
-        self, connection: HTTPConnection, *, needs_key: bool, is_unsafe: bool
-    ) -> None:
+    def _check_sender(self, scope: Scope, *, needs_key: bool, is_unsafe: bool) -> None:
         if self.access.has_keys:
-            authorization = header(connection.scope, b"authorization")
+            authorization = header(scope, b"authorization")
             # A foreign page cannot know a key, so host and origin do not matter with one.
-            if connection.scope["path"] in PROBES or self.access.find(authorization) is not None:
+            if scope["path"] in PROBES or self.access.find(authorization) is not None:
                 return
+            connection = HTTPConnection(scope)
             signed_in = self.admits is not None and self.admits(connection)
             if not signed_in and presented_key(authorization) is not None:
                 self.wrong_keys.count(connection)
@@ -333,7 +326,7 @@ class GuardMiddleware:
                 raise no_key(authorization) if self.admits is None else not_signed_in()
             if self.admits is None:
                 return
-        self.site.check(connection, is_unsafe=is_unsafe)
+        self.site.check(scope, is_unsafe=is_unsafe)
 
 
 ModelT = TypeVar("ModelT", bound=BaseModel)

@@ -8,7 +8,7 @@ import asyncio
 import os
 import threading
 from collections.abc import AsyncIterator, Iterator
-from contextlib import asynccontextmanager, contextmanager
+from contextlib import AbstractContextManager, asynccontextmanager, contextmanager
 from importlib import import_module
 from typing import TYPE_CHECKING
 
@@ -90,9 +90,9 @@ class Spans:
             scope["method"], context=above, kind=trace.SpanKind.SERVER
         ) as span:
             of_span = span.get_span_context()
-            yield TraceContext(
-                f"{of_span.trace_id:032x}", f"{of_span.span_id:016x}", f"{of_span.trace_flags:02x}"
-            )
+            trace_id, span_id = f"{of_span.trace_id:032x}", f"{of_span.span_id:016x}"
+            with in_trace(TraceContext(trace_id, span_id, f"{of_span.trace_flags:02x}")) as context:
+                yield context
             # The template, which is known once the request was routed.
             route = getattr(scope.get("route"), "path", "unmatched")
             span.update_name(f"{scope['method']} {route}")
@@ -105,13 +105,9 @@ class Spans:
 SPANS = Spans()
 
 
-@contextmanager
-def traced(scope: Scope) -> Iterator[str]:
-    """Continue the trace of a request's caller, or begin one; yields its id."""
-    caller = parse_traceparent(header(scope, b"traceparent") or "")
+def traced(scope: Scope) -> AbstractContextManager[TraceContext]:
+    """Continue the trace of a request's caller, or begin one; the context is the request's span."""
+    caller = parse_traceparent(sent) if (sent := header(scope, b"traceparent")) else None
     if SPANS.tracer is not None:
-        with SPANS.of_request(scope, caller) as context, in_trace(context):
-            yield context.trace_id
-        return
-    with in_trace(new_trace() if caller is None else caller.child()) as context:
-        yield context.trace_id
+        return SPANS.of_request(scope, caller)
+    return in_trace(new_trace() if caller is None else caller.child())

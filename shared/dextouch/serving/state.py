@@ -5,9 +5,8 @@ import math
 import time
 from collections import defaultdict
 from collections.abc import Awaitable, Callable, Mapping
-from dataclasses import dataclass
 from itertools import islice
-from typing import Any
+from typing import Any, NamedTuple
 
 import redis.asyncio
 from redis.commands.core import AsyncScript
@@ -28,8 +27,7 @@ ANSWER_TIMEOUT_S = 10.0
 Argument = str | bytes | int | float
 
 
-@dataclass(frozen=True)
-class Versioned:
+class Versioned(NamedTuple):
     """A value in two parts, its version, which starts at 1 and counts writes, and a short note."""
 
     value: bytes
@@ -62,8 +60,8 @@ class MemoryState:
 
     async def version(self, key: str) -> int:
         """The version that `get` would return, without the value; 0 when absent or expired."""
-        stored = await self.get(key)
-        return 0 if stored is None else stored.version
+        self._expire()
+        return self._entries[key][0].version if key in self._entries else 0
 
     async def note(self, key: str) -> bytes:
         """The note, without the value; empty when absent or expired."""

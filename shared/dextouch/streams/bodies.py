@@ -25,6 +25,9 @@ RIGHT_SHARE: Final = 0.9
 WRONG_SHARE: Final = 0.3
 ALWAYS_SHARE: Final = 0.98
 MAX_VIEW_RAD: Final = np.radians(75.0)
+# A wrist that is commanded over the first distance does not stay within the second one.
+MIN_COMMANDED_M: Final = 0.05
+MAX_STILL_M: Final = 0.01
 # By so much a robot's wrist is behind its command; another wrist is further away.
 MAX_LAG_RAD: Final = np.radians(30.0)
 MAX_LAG_M: Final = 0.15
@@ -56,7 +59,7 @@ class ImplausibleBody:
     """Why the poses of a stream cannot be those of its body, beside the others."""
 
     stream: str
-    cause: Literal["unit", "quaternion_order", "axes", "swapped"]
+    cause: Literal["unit", "quaternion_order", "axes", "swapped", "frozen"]
     message: str
 
 
@@ -192,9 +195,14 @@ def _check_commanded(bodies: _Bodies) -> ImplausibleBody | None:
     for name, other in zip(WRISTS, WRISTS[::-1], strict=True):
         if len(bodies.sent.get(name + COMMANDED, ())) < MIN_BODY_SAMPLES:
             continue
-        swapped = bodies.changed(_TURNS[_XYZW], name)
-        shares = bodies.as_commanded(name), swapped.as_commanded(name)
-        if found := _compared(name, "turned as commanded", shares, _XYZW):
+        ways_m = [np.ptp(bodies.at_m(of), axis=0).max() for of in (name, name + COMMANDED)]
+        if ways_m[0] < MAX_STILL_M and ways_m[1] > MIN_COMMANDED_M:
+            text = f"stands still while it is commanded over {ways_m[1]:.2f} m: restart its tracker"
+            return ImplausibleBody(name, "frozen", text)
+        turns = [(bodies.changed(_TURNS[one], name).as_commanded(name), one) for one in _TURNS]
+        share, turn = max(turns)
+        shares = bodies.as_commanded(name), share
+        if found := _compared(name, "turned as commanded", shares, turn):
             return found
         off_m = bodies.apart_m(name, name + COMMANDED)
         if off_m > MAX_LAG_M > bodies.apart_m(other, name + COMMANDED):

@@ -7,8 +7,8 @@ msgpack_numpy.py of openpi-client 0.1.2 (github.com/Physical-Intelligence/openpi
 
 import math
 import re
-from collections.abc import Callable, Mapping, Sized
-from typing import Any, Final, TypeVar
+from collections.abc import Callable, Mapping
+from typing import Any, Final
 
 import msgpack
 import numpy as np
@@ -29,8 +29,8 @@ DTYPES = ("uint8", "uint16", "int32", "int64", "float32", "float64", "bool")
 _NAMES = {np.dtype(name).newbyteorder("<"): name for name in DTYPES}
 # Kinds of dtypes of openpi that are read, bool, signed, unsigned and floating, and their names.
 _KINDS: Final = "biuf"
+_NUMPY: Final = (np.ndarray, np.generic)
 _DTYPE: Final = re.compile(r"[<>|=]?(b1|[iu][1248]|f[248])")
-C = TypeVar("C", bound=Sized)
 
 
 def pack(fields: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> bytes:
@@ -44,7 +44,7 @@ def pack(fields: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> bytes:
             if dtype not in DTYPES:
                 raise InvalidInputError(f"array {name!r}: dtype {dtype}, expected one of {DTYPES}")
             ordered = ordered.astype(np.dtype(dtype).newbyteorder("<"))
-        packed[name] = {"dtype": dtype, "shape": list(ordered.shape), "data": ordered.data}
+        packed[name] = {"dtype": dtype, "shape": ordered.shape, "data": ordered.data}
     try:
         return msgpack.packb({"fields": dict(fields), "arrays": packed})
     except OverflowError as error:
@@ -88,17 +88,17 @@ def unpack_bounded(
         raise LimitExceededError(f"{what}: got {len(data)} bytes, expected at most {max_bytes}")
     num_items = 0
 
-    def counted(container: C) -> C:
+    def counted(container: Any) -> Any:  # noqa: ANN401 - a list or a map
         nonlocal num_items
         num_items += 1 + len(container)
         if num_items > MAX_ITEMS:
             raise LimitExceededError(f"{what}: lists and maps hold more than {MAX_ITEMS} items")
-        return container
+        return container if of_map is None or type(container) is list else of_map(container)
 
     try:
         return msgpack.unpackb(
             data,
-            object_hook=counted if of_map is None else lambda found: of_map(counted(found)),
+            object_hook=counted,
             list_hook=counted,
             max_array_len=MAX_ITEMS_A_CONTAINER,
             max_map_len=MAX_ITEMS_A_CONTAINER,
@@ -131,7 +131,7 @@ def array_of(
     num_numbers = 1
     for n in counts or ():
         # Exactly int, since a bool is none.
-        num_numbers *= max(n, 1) if type(n) is int and n >= 0 else MAX_NUMBERS + 1
+        num_numbers *= n or 1 if type(n) is int and n >= 0 else MAX_NUMBERS + 1
     if counts is None or num_numbers > MAX_NUMBERS:
         raise InvalidInputError(
             f"{what}: shape {shape!r}, expected at most {MAX_DIMENSIONS} counts whose product is "
@@ -174,7 +174,7 @@ def unpack_openpi(data: bytes, *, max_bytes: int) -> dict[str, Any]:
 
 
 def _encoded(value: object) -> dict[bytes, Any]:
-    if not isinstance(value, np.ndarray | np.generic) or value.dtype.kind not in _KINDS:
+    if not isinstance(value, _NUMPY) or value.dtype.kind not in _KINDS:
         raise TypeError(f"got {type(value).__name__}, expected plain values and numeric arrays")
     if isinstance(value, np.generic):
         return {b"__npgeneric__": True, b"data": value.item(), b"dtype": value.dtype.str}

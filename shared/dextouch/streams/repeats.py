@@ -7,7 +7,10 @@ from typing import Final, Literal
 import numpy as np
 from jaxtyping import Bool, Float64
 
-ImplausibleCause = Literal["unit", "norm", "speed", "limits", "jump", "frozen", "repeated"]
+ImageFault = Literal["black", "torn", "older", "mixed", "pumping"]
+ImplausibleCause = (
+    Literal["unit", "norm", "speed", "limits", "jump", "frozen", "repeated"] | ImageFault
+)
 # As many equal steps may be a frozen stream.
 MIN_FROZEN_STEPS: Final = 5
 MAX_EQUAL_SHARE: Final = 0.01

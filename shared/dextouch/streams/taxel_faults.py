@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from dextouch.streams.repeats import Implausible, implausible_repeats
+from dextouch.streams.taxel_blocks import TaxelBlocks, drifting_taxels
 from dextouch.tactile.layout import DEXTOUCH_V1, TactileLayout
 
 # A cell that never moves is dead if it rests further than this from its tare.
@@ -95,6 +96,9 @@ class TaxelFaults:
         self._keys: list[np.ndarray] = []
         self._taxel_keys = np.zeros(num_taxels, dtype=np.uint64)
         self._zeros_kpa: list[float] = []
+        self.blocks = TaxelBlocks(
+            gain_counts_per_kpa, usable=self._usable, step=step, layout=layout
+        )
         zeros = np.zeros((10, num_taxels))
         self._finite, self._below, self._rest, self._kept, self._longest, self._random = zeros[:6]
         self._turns, self._dips, self._asked, self._silent = zeros[6:]
@@ -123,6 +127,7 @@ class TaxelFaults:
             window = offsets[first : first + RANDOM_WINDOW]
             self._note_random(window)
             self._note_silent(window)
+        self.blocks.add(counts, offsets)
         self._last = counts[-1]
         self.num_samples += len(counts)
 
@@ -192,6 +197,10 @@ class TaxelFaults:
     def repeats(self) -> list[Implausible]:
         """Samples that the device repeats, if its readings are noisy."""
         n = self.num_samples
+        dithered = self.blocks.dithered()
+        if dithered.any():
+            text = f"readings stay within a count of the same in {dithered.sum()} samples"
+            return [Implausible("frozen", text, dithered, whole=bool(dithered.all()))]
         keys = np.concatenate(self._keys) if self._keys else np.zeros(0, dtype=np.uint64)
         is_new = np.append(True, keys[1:] != keys[:-1])
         turns = self._turns[self._usable]
@@ -217,6 +226,9 @@ class TaxelFaults:
             "dead": (silent & (self._last == 0)) | is_deaf,
             "below_tare": is_below,
             "stuck": silent,
+            "saturated": self.blocks.clipped(),
+            "drifting": drifting_taxels(self.blocks.lows_kpa, self._usable, self._layout),
+            "ghost": self.blocks.ghosts(),
         }
 
     def _ended(self) -> Bool[np.ndarray, " taxels"]:

@@ -3,10 +3,10 @@
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping
 from contextlib import asynccontextmanager
 from functools import partial
-from typing import Any
+from typing import Any, Final
 
 from fastapi import FastAPI
-from prometheus_client.core import GaugeMetricFamily
+from prometheus_client.core import GaugeMetricFamily, HistogramMetricFamily
 from prometheus_client.metrics_core import Metric
 from prometheus_client.registry import Collector
 
@@ -28,6 +28,9 @@ from dextouch.worlds.rollouts import Reopen, RolloutService
 from dextouch.worlds.routes import ChunkShortcut, rollout_router, watch_router
 from dextouch.worlds.settings import WorldServiceSettings
 from dextouch.worlds.world import World
+
+# Limits of the buckets of a metric; a batch has 32 rollouts at most.
+BATCH_SIZES: Final = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
 
 
 class WorldMetrics(Collector):
@@ -54,7 +57,16 @@ class WorldMetrics(Collector):
         yield GaugeMetricFamily("dextouch_rollouts_limit", text, most)
         text = "1 while the process refuses new rollouts because it is about to end."
         yield GaugeMetricFamily("dextouch_draining", text, float(self._service.is_draining))
-        yield from self._service.batches.collect()
+        text = "Rollouts of a batch."
+        batches = HistogramMetricFamily("dextouch_batch_rollouts", text, labels=("world",))
+        for world, sizes in self._service.num_batches().items():
+            within = [
+                (str(most), sum(n for size, n in sizes.items() if size <= most))
+                for most in BATCH_SIZES
+            ]
+            within.append(("+Inf", sizes.total()))
+            batches.add_metric((world,), within, sum(size * n for size, n in sizes.items()))
+        yield batches
 
 
 def create_world_app(

@@ -2,15 +2,14 @@
 
 import asyncio
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Float64
-from prometheus_client import Histogram
 
 from dextouch.errors import LimitExceededError, UnavailableError
 from dextouch.schemas import EVERYTHING, ReturnSelector
@@ -21,8 +20,7 @@ ResultT = TypeVar("ResultT")
 SteppedBatch = tuple[float, float, list[tuple[SteppedRollout[State], bytes]]]
 
 
-@dataclass(frozen=True)
-class StepOutcome(Generic[State]):
+class StepOutcome(NamedTuple, Generic[State]):
     """Result of a step, its serialized state, and timings."""
 
     stepped: SteppedRollout[State]
@@ -31,25 +29,16 @@ class StepOutcome(Generic[State]):
     device_s: float
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class StepJob(Generic[State]):
-    """One rollout's next chunk, and what of its observation is wanted; made in the event loop."""
+    """One rollout's next chunk, and what of its observation is wanted; only a queued one waits."""
 
     state: State
     actions: Float64[np.ndarray, "steps 67"]
     seed: int
     selector: ReturnSelector = EVERYTHING
     since_s: float = field(default_factory=time.perf_counter, init=False)
-    outcome: "asyncio.Future[StepOutcome[State]]" = field(
-        default_factory=lambda: asyncio.get_running_loop().create_future(), init=False
-    )
-
-
-def batch_histogram() -> Histogram:
-    """A metric of batch sizes for the workers of a service, in no registry yet."""
-    name = "dextouch_batch_rollouts"
-    sizes = (1, 2, 4, 8, 16, 32)
-    return Histogram(name, "Rollouts of a batch.", ("world",), buckets=sizes, registry=None)
+    outcome: "asyncio.Future[StepOutcome[State]]" = field(init=False)
 
 
 class WorldWorker(Generic[State]):
@@ -65,10 +54,10 @@ class WorldWorker(Generic[State]):
         *,
         max_waiting: int = 256,
         max_batch: int = 32,
-        on_batch: Callable[[float], object] | None = None,
     ) -> None:
         self.world = world
-        self._on_batch = on_batch
+        # How many batches had this many rollouts.
+        self.num_batches: Counter[int] = Counter()
         self.max_waiting = max_waiting
         self._max_batch = max_batch if isinstance(world, BatchWorld) else 1
         self._waiting: deque[StepJob[State]] = deque()
@@ -103,6 +92,7 @@ class WorldWorker(Generic[State]):
                 f"expected at most {self.max_waiting}; try again",
                 retry_after_s=1,
             )
+        job.outcome = asyncio.get_running_loop().create_future()
         self._waiting.append(job)
         if not self._is_stepping:
             self._step_next()
@@ -150,8 +140,7 @@ class WorldWorker(Generic[State]):
     def _step_all(self, jobs: Sequence[StepJob[State]]) -> SteppedBatch[State]:
         """Runs in the world's thread; returns start time, duration, steps and snapshots."""
         began_s = time.perf_counter()
-        if self._on_batch is not None:
-            self._on_batch(len(jobs))
+        self.num_batches[len(jobs)] += 1
         # The test of a protocol takes longer than a step may.
         if len(jobs) > 1 and isinstance(self.world, BatchWorld):
             stepped = self.world.step_batch(

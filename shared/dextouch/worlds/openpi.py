@@ -77,7 +77,7 @@ def openpi_router(service: RolloutService) -> APIRouter:
                 except DexTouchError as error:
                     await socket.send_text(error.message)
                 else:
-                    await socket.send_bytes(answer)
+                    await socket.send({"type": "websocket.send", "bytes": answer})
 
     return router
 
@@ -86,7 +86,7 @@ class _Session:
     def __init__(self, service: RolloutService, owner: str, max_bytes: int) -> None:
         self._service = service
         self._owner = owner
-        self._max_bytes = max_bytes
+        self._unpack = partial(unpack_openpi, max_bytes=max_bytes)
         self._selector = EVERYTHING
         self._rollout_id: str | None = None
         self._next_chunk = 0
@@ -95,12 +95,11 @@ class _Session:
         """Carry out one message; raises DexTouchError without a change of the rollout."""
         if data is None:
             raise InvalidInputError("message: got text, expected msgpack in a binary message")
-        message = await decoded(partial(unpack_openpi, max_bytes=self._max_bytes), data)
-        given = [name for name in _FORMS if name in message]
-        known = set(_KNOWN)
+        message = await decoded(self._unpack, data)
+        given, known = message.keys() & _FORMS, _KNOWN
         if "start" in given:
-            known |= {"observation", *_arrays_of(message)}
-        if len(given) != 1 or set(message) - known:
+            known = known | {"observation", *_arrays_of(message)}
+        if len(given) != 1 or message.keys() - known:
             raise InvalidInputError(
                 f"message: got the keys {', '.join(sorted(message)) or 'none'}, expected one of "
                 f"{', '.join(_FORMS)}, and optionally chunk and return"
@@ -109,7 +108,7 @@ class _Session:
         if "return" in message:
             self._selector = validate_fields(ReturnSelector, message["return"], where="return")
         try:
-            return await getattr(self, f"_{given[0]}")(message)
+            return await getattr(self, f"_{given.pop()}")(message)
         except DexTouchError:
             self._selector = before
             raise
@@ -143,9 +142,7 @@ class _Session:
             )
         if not isinstance(chunk, int) or isinstance(chunk, bool):
             raise InvalidInputError(f"chunk: got {chunk!r}, expected a whole number")
-        answer = await self._service.step(
-            self._current(), chunk, np.asarray(actions, np.float64), self._selector
-        )
+        answer = await self._service.step(self._current(), chunk, actions, self._selector)
         return self._repacked(answer)
 
     async def _end(self, message: dict[str, Any]) -> bytes:

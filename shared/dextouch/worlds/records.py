@@ -9,9 +9,9 @@ import secrets
 import time
 from collections.abc import AsyncIterator, Mapping
 from contextlib import AsyncExitStack, asynccontextmanager, suppress
-from dataclasses import dataclass, field
-from functools import lru_cache, partial
-from typing import Any, Final
+from functools import lru_cache
+from types import MappingProxyType
+from typing import Any, Final, NamedTuple
 
 import msgpack
 import numpy as np
@@ -56,8 +56,7 @@ MAX_INLINE_IMAGE_BYTES: Final = 2**16
 AnswerParts = tuple[dict[str, Any], dict[str, np.ndarray]]
 
 
-@dataclass(frozen=True)
-class WatchNote:
+class WatchNote(NamedTuple):
     """What those who watch a rollout see beside its progress (see `WatchedRollout`)."""
 
     client: str = ""
@@ -69,14 +68,12 @@ class WatchNote:
 
     def after(self, seen: Observation) -> "WatchNote":
         """The note once this has been observed."""
-        began = self.client, self.key, self.begun_host_ns
-        return WatchNote(*began, seen.uncertainty, seen.success, self.trace_id)
+        return WatchNote(*self[:3], seen.uncertainty, seen.success, self.trace_id)
 
     def to_bytes(self, info: Mapping[str, Any]) -> bytes:
         """Serialize the note with the progress of its rollout and the time of this write."""
         uncertainty = None if self.uncertainty is None else self.uncertainty.model_dump()
-        began = self.client, self.key, self.begun_host_ns
-        known = (*began, uncertainty, self.success, self.trace_id)
+        known = (*self[:3], uncertainty, *self[4:])
         return msgpack.packb((info, time.time_ns(), known))
 
     @staticmethod
@@ -89,8 +86,7 @@ class WatchNote:
         return info, written_host_ns, restored
 
 
-@dataclass(frozen=True)
-class RolloutRecord:
+class RolloutRecord(NamedTuple):
     """Everything that another process needs to continue a rollout.
 
     `request_sha256` and `payload` are request and response of the newest chunk, for a client that
@@ -291,8 +287,7 @@ def ended_error(info: RolloutInfo) -> EndedError:
     )
 
 
-@dataclass(frozen=True)
-class Answer:
+class Answer(NamedTuple):
     """An encoded response; `replayed` if it was computed for an earlier, equal request.
 
     `parts` are its fields and arrays; None where only the bytes are known. `spent_s` are the times
@@ -302,7 +297,7 @@ class Answer:
     payload: bytes
     parts: AnswerParts | None = None
     replayed: bool = False
-    spent_s: Mapping[str, float] = field(default_factory=dict)
+    spent_s: Mapping[str, float] = MappingProxyType({})
 
 
 async def parts_of(
@@ -312,11 +307,10 @@ async def parts_of(
     **options: Any,  # noqa: ANN401 - see answer_parts
 ) -> AnswerParts:
     """Fields and arrays of a response, from a thread where encoding the images takes long."""
-    num_bytes = sum(images.nbytes for images in seen.images.values())
-    make = partial(answer_parts, rollout, seen, selector=selector, **options)
-    if selector.images == "raw" or num_bytes <= MAX_INLINE_IMAGE_BYTES:
-        return make()
-    return await asyncio.to_thread(make)
+    sizes = (images.nbytes for images in seen.images.values())
+    if selector.images == "raw" or sum(sizes) <= MAX_INLINE_IMAGE_BYTES:
+        return answer_parts(rollout, seen, selector=selector, **options)
+    return await asyncio.to_thread(answer_parts, rollout, seen, selector=selector, **options)
 
 
 @lru_cache(maxsize=64)

@@ -7,11 +7,10 @@ committed when its record replaces the version it was computed from (compare and
 import asyncio
 import hashlib
 import time
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from collections.abc import Callable, Mapping
 from contextlib import AbstractAsyncContextManager
-from dataclasses import replace
-from typing import Any
+from typing import Any, Final
 from weakref import WeakValueDictionary
 
 import numpy as np
@@ -38,7 +37,7 @@ from dextouch.schemas import (
 from dextouch.serving import StateStore
 from dextouch.streams import pack
 from dextouch.tracing import current_trace_id
-from dextouch.worlds.batcher import StepJob, WorldWorker, batch_histogram
+from dextouch.worlds.batcher import StepJob, WorldWorker
 from dextouch.worlds.records import (
     Answer,
     RecordStore,
@@ -63,6 +62,7 @@ from dextouch.worlds.world import (
 
 logger = structlog.get_logger(__name__)
 
+_FLOAT64: Final = np.dtype("<f8")
 # Opens the world of this name and digest, or returns None where it is not to be had.
 Reopen = Callable[[str, str], World[Any] | None]
 
@@ -92,15 +92,11 @@ class RolloutService:
         self._reopen = reopen
         self._reopened: dict[tuple[str, str], WorldWorker[Any]] = {}
         self._reopening = asyncio.Lock()
-        self.batches = batch_histogram()
-        self._workers = {
-            name: WorldWorker(world, on_batch=self.batches.labels(name).observe)
-            for name, world in worlds.items()
-        }
+        self._workers = {name: WorldWorker(world) for name, world in worlds.items()}
         self._records = RecordStore(store, ttl_s=self.limits.ttl_s)
         # The newest states of this process's rollouts, least recently used first, with their
-        # records, of which snapshot and payload are left out.
-        self._live: OrderedDict[str, tuple[RolloutRecord, Any]] = OrderedDict()
+        # records, of which snapshot and payload are left out, and locks.
+        self._live: OrderedDict[str, tuple[RolloutRecord, Any, object]] = OrderedDict()
         self._locks: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()
         # Of those, the ones that no chunk has renewed since the last sweep.
         self._unused: set[str] = set()
@@ -123,6 +119,14 @@ class RolloutService:
         return {
             name: (worker.num_waiting, worker.max_waiting) for name, worker in self._workers.items()
         }
+
+    def num_batches(self) -> dict[str, Counter[int]]:
+        """How many batches had how many rollouts, by world."""
+        reopened = [(name, worker) for (name, _), worker in self._reopened.items()]
+        found: dict[str, Counter[int]] = {}
+        for name, worker in (*self._workers.items(), *reopened):
+            found[name] = found.get(name, Counter()) + worker.num_batches.copy()
+        return found
 
     def drain(self) -> None:
         """Refuse new rollouts from now on."""
@@ -216,15 +220,15 @@ class RolloutService:
             EndedError: the world cannot continue; later chunks get the same error.
             LimitExceededError: the rollout has its maximum length, or the queue is full.
         """
-        lock = self._locks.setdefault(rollout_id, asyncio.Lock())
-        async with lock:
+        lock = self._locks.get(rollout_id)
+        async with lock or self._locks.setdefault(rollout_id, asyncio.Lock()):
             record = await self._newest(rollout_id, chunk)
             worker = await self._worker_of(record.info)
             description = worker.world.description
             check_selector(selector, description)
             checked = check_chunk(actions, description)
             digest = hashlib.sha256(selector_bytes(selector))
-            digest.update(np.ascontiguousarray(checked, dtype="<f8").data)
+            digest.update(np.ascontiguousarray(checked, dtype=_FLOAT64).data)
             sha256 = digest.hexdigest()
             replayed = record.replay(chunk, sha256)
             if replayed is not None:
@@ -265,7 +269,7 @@ class RolloutService:
         info = parent.info.model_copy(update=changed)
         async with self._place(info.id) as placed:
             begun_host_ns, trace_id = time.time_ns(), current_trace_id()
-            note = replace(parent.note, key=owner, begun_host_ns=begun_host_ns, trace_id=trace_id)
+            note = parent.note._replace(key=owner, begun_host_ns=begun_host_ns, trace_id=trace_id)
             record = RolloutRecord(info, parent.snapshot, None, parent.payload, placed, note)
             await self._records.write(record)
         logger.info("rollout_forked", rollout_id=info.id, parent_id=rollout_id)
@@ -286,7 +290,7 @@ class RolloutService:
 
     async def _newest(self, rollout_id: str, chunk: int) -> RolloutRecord:
         """The record; without its large parts if the live state is to be advanced."""
-        held, _ = self._live.get(rollout_id, (None, None))
+        held, _, _ = self._live.get(rollout_id, (None, None, None))
         # Any other chunk is a repetition, which needs the stored response, or a conflict.
         is_next = held is not None and chunk == held.info.next_chunk
         if held is not None and is_next and await self._records.is_newest(held):
@@ -303,7 +307,7 @@ class RolloutService:
     ) -> Answer:
         """Compute a chunk and commit its record."""
         before = stored.info
-        held, state = self._live.get(before.id, (None, None))
+        held, state, _ = self._live.get(before.id, (None, None, None))
         if held is None or held.version != stored.version:
             state = await worker.call(worker.world.restore, stored.snapshot)
         seed = chunk_seed(before.seed, before.next_chunk, before.world_digest)
@@ -328,20 +332,20 @@ class RolloutService:
         version = await self._records.write(record, parts[0]["rollout"])
         self._keep(RolloutRecord(info, b"", version=version, note=note), outcome.stepped.state)
         stored_s = time.perf_counter() - began_s - encoded_s
-        spent_s = {"queue": outcome.queued_s, "device": outcome.device_s}
-        return Answer(payload, parts, spent_s=spent_s | {"encode": encoded_s, "store": stored_s})
+        spent_s = {"queue": outcome.queued_s, "device": outcome.device_s, "encode": encoded_s}
+        return Answer(payload, parts, spent_s=spent_s | {"store": stored_s})
 
     async def _end(self, record: RolloutRecord, error: EndedError) -> EndedError:
         """Mark a rollout as ended; returns the error that later chunks get."""
         info = record.info.model_copy(update={"ended": error.reason})
         stored = await self._records.read(info.id)
-        await self._records.write(replace(stored, info=info, version=record.version))
+        await self._records.write(stored._replace(info=info, version=record.version))
         self._live.pop(info.id, None)
         logger.info("rollout_ended", rollout_id=info.id, reason=error.reason)
         return ended_error(info)
 
     def _keep(self, record: RolloutRecord, state: object) -> None:
-        self._live[record.info.id] = (record, state)
+        self._live[record.info.id] = (record, state, self._locks.get(record.info.id))
         self._live.move_to_end(record.info.id)
         self._unused.discard(record.info.id)
         if len(self._live) > self.limits.max_rollouts:
@@ -383,8 +387,7 @@ class RolloutService:
             if began not in self._reopened and self._reopen is not None:
                 world = await asyncio.to_thread(self._reopen, *began)
                 if world is not None:
-                    observe = self.batches.labels(info.world).observe
-                    self._reopened[began] = WorldWorker(world, on_batch=observe)
+                    self._reopened[began] = WorldWorker(world)
                     logger.info("world_reopened", world=info.world, digest=info.world_digest)
         if began not in self._reopened:
             raise ConflictError(

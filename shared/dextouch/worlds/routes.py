@@ -45,6 +45,7 @@ from dextouch.serving import (
     AccessControl,
     RequireScope,
     decoded,
+    header,
     media_type,
     takes,
     timed,
@@ -65,9 +66,11 @@ CLIENT_HEADER: Final = "dextouch-client"
 MAX_CLIENT_LETTERS: Final = 64  # chosen: a name in a list
 MAX_WATCHED: Final = 200  # chosen: a list that people read
 REPLAYED_HEADER: Final = "dextouch-replayed"
-DTYPES: Final = ("float32", "float64")
+DTYPES: Final[dict[str, np.dtype[Any]]] = {"float32": np.dtype("<f4"), "float64": np.dtype("<f8")}
 _PATH: Final = re.compile(r"/v1/rollouts/([^/]+)/chunks/([0-9]{1,9})")
-_DTYPE_OF: Final = {f"{OCTETS}; dtype={dtype}".encode(): dtype for dtype in DTYPES}
+_DTYPE_OF: Final = {f"{OCTETS}; dtype={dtype}": dtype for dtype in DTYPES}
+_REPLAYED, _COMPUTED = ((REPLAYED_HEADER.encode(), value) for value in (b"true", b"false"))
+_CONTENT_TYPE: Final = (b"content-type", MSGPACK.encode())
 _MAX_QUERIES: Final = 64  # chosen: clients use a few
 _MAX_QUERY_BYTES: Final = 256  # chosen: cameras and options fit
 
@@ -143,17 +146,15 @@ class ChunkShortcut:
         place = _PATH.fullmatch(scope["path"])
         if learned is None or place is None or scope["method"] != "POST":
             return None
-        # Of several headers of one name the first counts, as in Starlette.
-        headers = dict(scope["headers"][::-1])
-        dtype = _DTYPE_OF.get(headers.get(b"content-type", b""))
-        if dtype is None or wants_json(headers.get(b"accept", b"").decode("latin-1")):
+        dtype = _DTYPE_OF.get(header(scope, b"content-type") or "")
+        if dtype is None or wants_json(header(scope, b"accept") or ""):
             return None
         selector, scope["route"] = learned
         rollout_id, chunk = place[1], int(place[2])
 
         async def step(scope: Scope, receive: Receive, send: Send) -> None:
             access: AccessControl = scope["app"].state.access
-            access.check(headers.get(b"authorization", b"").decode("latin-1"), SCOPE)
+            access.check(header(scope, b"authorization"), SCOPE)
             body = await _body(receive)
             spent_s: dict[str, float] = scope["state"]["timings_s"]
             began_s = time.perf_counter()
@@ -163,12 +164,10 @@ class ChunkShortcut:
                 spent_s["decode"] = time.perf_counter() - began_s
             answer = await self._service.step(rollout_id, chunk, actions, selector)
             spent_s |= answer.spent_s
-            size = str(len(answer.payload)).encode()
-            replayed = b"true" if answer.replayed else b"false"
             answered = [
-                (REPLAYED_HEADER.encode(), replayed),
-                (b"content-length", size),
-                (b"content-type", MSGPACK.encode()),
+                _REPLAYED if answer.replayed else _COMPUTED,
+                (b"content-length", b"%d" % len(answer.payload)),
+                _CONTENT_TYPE,
             ]
             await send({"type": "http.response.start", "status": 200, "headers": answered})
             await send({"type": "http.response.body", "body": answer.payload})
@@ -354,10 +353,10 @@ def actions_from(body: bytes, dtype: str) -> Shaped[np.ndarray, "..."]:
             f"chunk: got dtype {dtype!r}, expected the header "
             f"'Content-Type: {OCTETS}; dtype=float32' or float64"
         )
-    row_bytes = ACTION_DIM * np.dtype(dtype).itemsize
+    row_bytes = ACTION_DIM * DTYPES[dtype].itemsize
     if not body or len(body) % row_bytes:
         raise ShapeError(
             f"chunk: got {len(body)} bytes, expected a multiple of {row_bytes} "
             f"([K, {ACTION_DIM}] {dtype}, little endian)"
         )
-    return np.frombuffer(body, np.dtype(dtype).newbyteorder("<")).reshape(-1, ACTION_DIM)
+    return np.frombuffer(body, DTYPES[dtype]).reshape(-1, ACTION_DIM)

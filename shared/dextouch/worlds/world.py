@@ -29,7 +29,6 @@ from dextouch.hands.actions import (
 )
 from dextouch.schemas import (
     EVERYTHING,
-    OBSERVED_ARRAYS,
     Observation,
     ReturnSelector,
     RolloutStart,
@@ -264,8 +263,8 @@ def _check_fits(
     *,
     where: str,
 ) -> None:
-    arrays = {name: getattr(observation, name) for name in OBSERVED_ARRAYS}
-    check_observation_arrays(**arrays, where=where)
+    seen = observation.images, observation.tactile_kpa, observation.action_reached
+    check_observation_arrays(*seen, observation.object_poses, where=where)
     if (num_taxels := observation.tactile_kpa.shape[-1]) != description.num_taxels:
         layout = description.tactile_layout
         raise ShapeError(
@@ -273,7 +272,7 @@ def _check_fits(
             f"{description.num_taxels} of layout "
             f"{'dextouch_v1' if layout is None else layout.name!r}"
         )
-    if set(observation.images) != set(cameras):
+    if observation.images.keys() != set(cameras):
         raise ShapeError(
             f"{where}: got images of {sorted(observation.images)}, expected of {sorted(cameras)}"
         )

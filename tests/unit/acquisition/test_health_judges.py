@@ -283,6 +283,7 @@ class CheckedDriver(Driver):
     ("change", "code"),
     [
         ({"frozen": True}, "image_frozen"),
+        ({"fault": "torn"}, "image_content"),
         ({"blurred": True}, "image_blurred"),
         ({"gap": True}, "image_gap"),
         ({"clipped_ratio": 0.3}, "image_clipped"),
@@ -290,13 +291,26 @@ class CheckedDriver(Driver):
 )
 def test_bad_images_warn_and_are_an_error_after_a_second(change, code):
     driver = driver_of(PoseTrackerDecoder("head"), CheckedDriver)
-    judge = CameraCheck(driver)
+    judge = CameraCheck(driver, "camera_head")
     assert judged(judge, block([]), 0).findings == []
     driver.quality = ImageQuality(**change)
     seen = [codes(judged(judge, block([]), t * SECOND_NS)) for t in (1, 2)]
     assert seen == [{code: "WARN"}, {code: "ERROR"}]
     driver.quality = ImageQuality()
     assert judged(judge, block([]), 3 * SECOND_NS).findings == []
+
+
+def test_a_picture_that_stays_while_its_camera_moves_is_frozen():
+    driver, bodies = driver_of(PoseTrackerDecoder("head"), CheckedDriver), BodiesCheck({})
+    judge, tracker = CameraCheck(driver, "camera_head", bodies), bodies.of("head")
+    driver.quality = ImageQuality(still_s=2.0)
+    for turn_rad, expected in ((0.01, {}), (0.3, {"image_frozen": "WARN"})):
+        t_ns = np.arange(100) * SECOND_NS // 100
+        angles = np.linspace(0, turn_rad, 100) / 2
+        poses = np.zeros((100, 7))
+        poses[:, 3], poses[:, 6] = np.cos(angles), np.sin(angles)
+        judged(tracker, block(t_ns, poses), SECOND_NS)
+        assert codes(judged(judge, block([]), SECOND_NS)) == expected
 
 
 def test_blocks_are_bounded_and_count_what_they_lose():

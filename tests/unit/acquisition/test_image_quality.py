@@ -17,6 +17,7 @@ from services.acquisition.drivers.images import (
     quarter_size,
 )
 from services.acquisition.mocks.pattern import pattern_streams
+from tests.unit.streams import moving_camera
 
 PERIOD_NS = 33_333_333
 
@@ -184,3 +185,22 @@ def test_a_720p_image_costs_less_than_a_millisecond(rng):
     least_ns = min(np.mean(took_ns[at : at + 9]) for at in range(0, 90, 9))
     sys.stdout.write(f"image quality: {least_ns / 1e3:.0f} us a 720p image\n")
     assert least_ns < 1_000_000
+
+
+def test_contents_that_no_camera_sends_are_said_live_whatever_encodes_them():
+    _, images = moving_camera.images(0, 4)
+    checker = ImageChecker(period_ns=PERIOD_NS)
+    for image in images:
+        checker.check(image)
+    assert (checker.quality.fault, checker.quality.num_faulty) == (None, 0)
+    assert checker.quality.still_s < 0.5
+    images[1::4] = np.random.default_rng(0).integers(0, 6, images[1::4].shape)
+    for image in images:
+        # A gray copy at an eighth of the size, such as a check of JPEG leaves.
+        checker.see(image[::8, ::8, 1:2])
+    assert checker.quality.fault == "black"
+    assert checker.quality.num_faulty == pytest.approx(len(images) / 4, abs=8)
+    noise = np.random.default_rng(1).normal(0, 3, images.shape)
+    for image in np.clip(images[:1] + noise, 0, 255).astype(np.uint8):
+        checker.check(image)
+    assert checker.quality.still_s == pytest.approx(len(images) * PERIOD_NS * 1e-9, abs=0.1)

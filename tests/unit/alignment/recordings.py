@@ -2,8 +2,9 @@
 
 import numpy as np
 
-from dextouch.schemas import RecordingAttributes
-from dextouch.streams import SampleBatch, StreamDescriptor
+from dextouch.images import jpeg_size
+from dextouch.schemas import RecordingAttributes, matrix_rows
+from dextouch.streams import SampleBatch, StreamDescriptor, encoded_values
 
 K_HEAD = ((60.0, 0.0, 32.0), (0.0, 60.0, 32.0), (0.0, 0.0, 1.0))
 POSE = np.array([0.1, 0.2, 0.3, 1.0, 0.0, 0.0, 0.0])
@@ -21,11 +22,15 @@ def write_recording(
     edit=lambda name, values: values,
     task="stand-bottle",
     trace_id=None,
+    camera=None,
 ):
     """A robot that stands still; `lost` are (stream, first, last) samples that never arrived.
 
-    `calibration` is added to that of the recording, `edit` changes a stream's values.
+    `calibration` is added to that of the recording, `edit` changes a stream's values, and `camera`
+    is the matrix of a head camera with times (ns) and JPEG images.
     """
+    if camera is not None:
+        calibration = {**(calibration or {}), "K_head": matrix_rows(camera[0])}
     attributes = RecordingAttributes(
         recording_id=recording_id,
         task=task,
@@ -58,6 +63,19 @@ def write_recording(
                 t_host_ns=t_ns[arrived] + START_NS,
                 t_device_ns=t_ns[arrived] + 9 * 10**11,
             )
+        if camera is not None:
+            _, times_ns, images = camera
+            stream = StreamDescriptor(
+                name="camera_head",
+                kind="image",
+                shape=(*jpeg_size(images[0]), 3),
+                dtype="uint8",
+                unit="jpeg",
+                nominal_rate_hz=30,
+            )
+            writer.add_stream(stream)
+            values = encoded_values(images)
+            writer.append("camera_head", values=values, t_host_ns=times_ns + START_NS)
 
 
 def stamped(true_s, stamps_ns, rate_hz):

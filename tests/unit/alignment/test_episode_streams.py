@@ -5,7 +5,7 @@ import pytest
 
 from dextouch import images
 from dextouch.episodes import GOP_IMAGES, EpisodeStore
-from dextouch.episodes.image_codecs import ImageGroups
+from dextouch.episodes.image_codecs import ImageForm, ImageGroups
 from dextouch.errors import NotFoundError
 from dextouch.streams import StreamDescriptor
 from services.alignment import jobs
@@ -73,7 +73,14 @@ def no_decoding(monkeypatch):
     def refuse(*_, **__):
         raise AssertionError("an image was decoded or encoded")
 
-    monkeypatch.setattr(ImageGroups, "decode", refuse)
+    decode = ImageGroups.decode
+
+    def decode_small(self, images, number, places, form, out):
+        # Alignment looks at small gray copies, of which nothing is written.
+        assert form == ImageForm(half_size=True, gray=True)
+        decode(self, images, number, places, form, out)
+
+    monkeypatch.setattr(ImageGroups, "decode", decode_small)
     monkeypatch.setattr(images, "encode_jpeg", refuse)
     monkeypatch.setattr("dextouch.episodes.writer.encode_jpeg", refuse)
     monkeypatch.setattr("dextouch.episodes.writer.GopEncoder", refuse)

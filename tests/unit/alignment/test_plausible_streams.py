@@ -1,6 +1,7 @@
 """Implausible values of a recording are left out of its episode, or refuse it, by their cause."""
 
 from dataclasses import replace
+from io import StringIO
 from typing import get_args
 
 import numpy as np
@@ -11,6 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import ClockFitError, InvalidInputError
+from dextouch.geometry import pose_from_transform
+from dextouch.images import encode_jpeg
 from dextouch.schemas import matrix_rows
 from dextouch.streams import NO_SEQUENCE, ClockCapabilities
 from services.alignment.calibration.tactile_tare import (
@@ -31,6 +34,7 @@ from services.alignment.synchronization.recorded_streams import date_stream
 from services.alignment.synchronization.resampling import RefusedReason
 from services.alignment.synchronization.stream_clock import time_stream
 from tests.unit.alignment import recordings
+from tests.unit.streams import moving_camera
 
 SECONDS = 6
 
@@ -372,11 +376,12 @@ def test_taxels_that_are_random_from_some_moment_on():
     assert reasons_of(calibration, counts)[REASONS[RANDOM]].tolist() == list(range(20))
 
 
-def test_a_press_at_full_scale_and_a_frozen_glove_condemn_no_taxel():
+def test_a_press_at_full_scale_ends_there_and_a_frozen_glove_condemns_no_taxel():
     _, calibration = glove()
     counts = readings(calibration)
     counts[600:, calibration.cells[100:140]] = 65535
-    assert reasons_of(calibration, counts) == {}
+    found = reasons_of(calibration, counts)
+    assert {name: of.tolist() for name, of in found.items()} == {"saturated": [*range(100, 140)]}
     counts = readings(calibration)
     counts[700:] = counts[700]
     assert reasons_of(calibration, counts) == {}
@@ -496,3 +501,57 @@ def test_the_command_says_what_it_left_out(tmp_path):
         console.print(report_page(report))
     assert "head: frozen samples" in page.get()
     assert set(WHY) == set(get_args(RefusedReason))
+
+
+def seen_by_head(folder, change, *, late_s=0.0):
+    """A take whose head turns, with JPEG images of its camera, changed."""
+    store = EpisodeStore(folder)
+    t_ns, pictures = moving_camera.images(0, SECONDS, late_s, 60)
+    Ts = moving_camera.poses(0, SECONDS, 60)[1]
+
+    def turning(name, values):
+        if name == "head":
+            values[:] = pose_from_transform(Ts[: len(values)])
+        return values
+
+    recordings.write_recording(
+        store,
+        "take",
+        seconds=SECONDS,
+        edit=turning,
+        camera=(moving_camera.K, t_ns, [encode_jpeg(image) for image in change(pictures)]),
+    )
+    report = align_recording(store, "take", AlignmentOptions())
+    return report, store.open(report.episode_id)
+
+
+def test_images_that_no_camera_takes_are_left_out_counted_and_placed(tmp_path):
+    def fault(pictures):
+        pictures[[40, 41, 70]] = 3
+        pictures[100, 60:] = 128
+        return pictures
+
+    report, episode = seen_by_head(tmp_path / "faulty", fault)
+    quality = report.quality
+    assert quality["camera_head_num_black_samples"] == 3
+    assert quality["camera_head_first_black_s"] == pytest.approx(40 / 30, abs=0.01)
+    assert quality["camera_head_num_torn_samples"] == 1
+    assert min(image.mean() for image in episode.images("camera_head")) > 30
+    console = Console(width=200, record=True, file=StringIO())
+    console.print(report_page(report))
+    assert "camera_head: 3 black images between others" in console.export_text()
+    report, _ = seen_by_head(tmp_path / "right", lambda pictures: pictures)
+    assert [name for name in report.quality if "first" in name or "_lag_" in name] == []
+    assert report.quality["camera_head_still_share"] == 0
+
+
+def test_mirrored_images_are_refused_and_late_ones_are_said(tmp_path):
+    with pytest.raises(InvalidInputError, match="mirrored, left for right") as error:
+        seen_by_head(tmp_path / "mirrored", lambda pictures: pictures[:, :, ::-1])
+    assert error.value.details["stream"] == "camera_head"
+    report, _ = seen_by_head(tmp_path / "late", lambda pictures: pictures, late_s=0.2)
+    lag_s, sigma_s = (report.quality[f"camera_head_lag{name}_s"] for name in ("", "_sigma"))
+    assert abs(lag_s - 0.2) < 4 * sigma_s < 0.08
+    console = Console(width=200, record=True, file=StringIO())
+    console.print(report_page(report))
+    assert "later than their times" in console.export_text()

@@ -75,11 +75,11 @@ def encoded(pixels, form):
     return file.getvalue()
 
 
-def video(num_images, *, keyint, codec="libx264", bframes=0, tune="zerolatency"):
+def video(num_images, *, keyint, codec="libx264", bframes=0, tune="zerolatency", size_px=(48, 64)):
     """Access units of an encoder that is not the store's; image k has level 20 (k mod 10)."""
     av = pytest.importorskip("av")
     encoder = av.CodecContext.create(codec, "w")
-    encoder.width, encoder.height, encoder.pix_fmt = 64, 48, "yuv420p"
+    (encoder.height, encoder.width), encoder.pix_fmt = size_px, "yuv420p"
     encoder.time_base = Fraction(1, 30)
     option = {"libx264": "x264-params", "libx265": "x265-params"}[codec]
     encoder.options = {
@@ -88,7 +88,7 @@ def video(num_images, *, keyint, codec="libx264", bframes=0, tune="zerolatency")
     }
     units = []
     for index in range(num_images):
-        frame = av.VideoFrame.from_ndarray(np.full((48, 64, 3), 20 * (index % 10), np.uint8))
+        frame = av.VideoFrame.from_ndarray(np.full((*size_px, 3), 20 * (index % 10), np.uint8))
         frame.pts = index
         units += [bytes(packet) for packet in encoder.encode(frame)]
     return units + [bytes(packet) for packet in encoder.encode(None)]

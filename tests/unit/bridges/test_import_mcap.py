@@ -3,6 +3,7 @@
 import base64
 import struct
 import tracemalloc
+from functools import partial
 
 import numpy as np
 import pytest
@@ -15,9 +16,7 @@ from dextouch.bridges.import_messages import items_of
 from dextouch.bridges.import_recording import ImportAttributes
 from dextouch.bridges.mcap import export_mcap, records
 from dextouch.episodes import EpisodeStore
-from dextouch.errors import (
-    InvalidInputError,
-)
+from dextouch.errors import CorruptDataError, InvalidInputError
 from tests.unit.bridges.foreign_files import (
     GOLDEN,
     PIXELS,
@@ -207,6 +206,46 @@ def test_points_have_fields_of_all_types(schema, size, kind, names):
     assert item.form.names == tuple(numbers)
 
 
+def test_points_in_rows_that_end_in_padding_and_with_fields_of_count_zero():
+    """PCL writes no padding, but reads it; drivers write the count 0 and any step of one row."""
+    points = np.arange(24, dtype=">f4").reshape(2, 4, 3)
+    padded = np.concatenate([points.view("u1").reshape(2, -1), np.full((2, 5), 9, "u1")], axis=1)
+    fields = [{"name": n, "offset": 4 * k, "datatype": 7, "count": 0} for k, n in enumerate("xyz")]
+    cloud = {"fields": fields, "point_step": 12, "is_bigendian": True}
+    rows = {"width": 4, "height": 2, "row_step": 53, "data": padded.tobytes()[:-5]}
+    read = partial(items_of, "sensor_msgs/PointCloud2")
+    assert read(cloud | rows)[0].decode().tolist() == points.reshape(8, 3).tolist()
+    one = {"width": 8, "height": 1, "row_step": 0, "data": points.tobytes()}
+    assert read(cloud | one)[0].decode().tolist() == points.reshape(8, 3).tolist()
+    for wrong in ({"row_step": 47}, {"height": 3}, {"width": -4, "height": -2}, {"width": 5}):
+        with pytest.raises(CorruptDataError, match="bytes for"):
+            read(cloud | rows | wrong)
+    fields[0]["count"] = 3
+    with pytest.raises(InvalidInputError, match="'x' of 3 numbers of type 7"):
+        read(cloud | rows)
+
+
+def test_joints_of_one_name_are_not_mistaken_for_each_other(store, tmp_path):
+    def joints(*pairs):
+        return {"joints": [{"name": name, "position": value} for name, value in pairs]}
+
+    messages = [
+        ("/j", "foxglove.JointStates", joints(("a", 1), ("b", 2), ("a", 3))),
+        ("/j", "foxglove.JointStates", joints(("a", 4), ("b", 5), ("a", 6))),
+        ("/j", "foxglove.JointStates", joints(("a", 1), ("a", 2), ("b", 3))),
+        (
+            "/none",
+            "foxglove.PointCloud",
+            {"data": "", "point_stride": 4, "fields": [{"name": "x", "offset": 0, "type": 7}]},
+        ),
+    ]
+    report = import_any_mcap(json_file(tmp_path / "j.mcap", messages), store, ImportAttributes())
+    assert store.recording("j").values("j", 0, 2).tolist() == [[1, 2, 3], [4, 5, 6]]
+    reasons = {one.source: one.reason for one in report.refused}
+    assert "of other names" in reasons["/j"]
+    assert reasons["/none"] == "samples without a number, numbers [0, 1]"
+
+
 def stripped(reader, store, folder, name):
     """What becomes of an export of ours that another tool filtered."""
     export_mcap(reader, folder / "whole.mcap", overwrite=True)
@@ -252,6 +291,8 @@ def test_numbers_are_neither_dropped_nor_rounded_unsaid(store, tmp_path):
         ("/b", "", {"big": 0, "list": [1, 2]}),
         ("/b", "", {"big": 2**60 + 1, "list": [1, 2**53 + 1]}),
         ("/c", "", stamped),
+        ("/d", "", {"dextouch_sequence": "a", "dextouch_t_device_ns": 10**30, "v": 1}),
+        ("/d", "", {"dextouch_sequence": 10**30, "timestamp": {"sec": 1.75}, "v": 2}),
         ("/deep", "", b'{"a":' * 900 + b"1" + b"}" * 900),
         ("/lists", "", b'{"a":' + b"[" * 900 + b"1" + b"]" * 900 + b"}"),
         ("/empty", "", b'{"a":[' + b"{}," * (1 << 20) + b"{}]}"),
@@ -260,12 +301,42 @@ def test_numbers_are_neither_dropped_nor_rounded_unsaid(store, tmp_path):
     streams = store.recording("a").streams
     assert (streams["a"].names, streams["c"].names) == (("timestamp", "v"), ("header.seq", "v"))
     assert store.recording("a").stamps("c").t_device_ns.tolist() == [10**9 + 2]
+    odd = store.recording("a").stamps("d")
+    assert (odd.sequence.tolist(), odd.t_device_ns.tolist()) == ([-1, -1], [-1, 1_750_000_000])
     notes = {one.source: one.notes for one in report.imported}
     assert notes["/b"] == ("above 2^53, rounded: big, list",)
     reasons = {one.source: one.reason for one in report.refused}
     assert "more than 64 deep" in reasons["/deep"]
     assert "more than 64 deep" in reasons["/lists"]
     assert "more than 1048576 values" in reasons["/empty"]
+
+
+def test_whole_numbers_of_a_message_stay_whole(store, tmp_path):
+    """As counts of raw cells, which as floats would be taxels in kPa."""
+    pytest.importorskip("mcap_ros2")
+    recorder = Recorder(tmp_path / "cells.mcap")
+    fields = (b"uint16[360] cells", b"int64 n\nuint64 u", b"int64 n\nfloat64[] x", b"uint64 u")
+    for k, field in enumerate(fields):
+        recorder.channel(f"/m{k}", f"lab/msg/M{k}", "ros2msg", field, "cdr")
+    cells = np.arange(360, dtype="<u2")
+    for k, body in enumerate(
+        (
+            cells.tobytes(),
+            struct.pack("<qQ", 2**60 + 1, 5),
+            struct.pack("<qIxxxxd", 3, 1, 0.5),
+            struct.pack("<Q", 2**64 - 2),
+        )
+    ):
+        recorder.raw(f"/m{k}", b"\0\1\0\0" + body, T0)
+    about = ImportAttributes(mapping={"tactile_left": "/m0"})
+    report = import_any_mcap(recorder.done(), store, about)
+    recording = store.recording("cells")
+    stream = recording.streams["tactile_left"]
+    assert (stream.unit, stream.kind, stream.shape) == ("counts", "tactile", (360,))
+    assert recording.values("tactile_left", 0, 1)[0].tolist() == cells.tolist()
+    assert recording.values("m1", 0, 1).tolist() == [[2**60 + 1, 5]]
+    assert recording.values("m2", 0, 1).tolist() == [[3, 0.5]]
+    assert [one.notes for one in report.imported if one.notes] == [("above 2^53, rounded: u",)]
 
 
 def test_rectified_images_have_the_matrix_of_their_projection(store, tmp_path):
@@ -422,3 +493,16 @@ def test_video_with_b_frames_is_refused(codec, store, tmp_path):
         recorder.add("/video", "CompressedVideo", T0 + k * STEP, data=data, format=form)
     with pytest.raises(InvalidInputError, match="B-frames"):
         import_any_mcap(recorder.done(), store, ImportAttributes())
+
+
+def test_images_of_another_size_later_in_a_video_are_refused(store, tmp_path):
+    """As a camera sends them whose resolution is changed while it records."""
+    recorder = Recorder(tmp_path / "video.mcap")
+    units = [*video(16, keyint=8), *video(8, keyint=8, size_px=(64, 96))]
+    for k, data in enumerate(units):
+        recorder.add("/video", "CompressedVideo", T0 + k * STEP, data=data, format="h264")
+    report = import_any_mcap(recorder.done(), store, ImportAttributes())
+    level = store.recording("video").values("video", 0, 16).mean((1, 2, 3))
+    np.testing.assert_allclose(level, [20 * (k % 10) for k in range(16)], atol=6)
+    (refused,) = report.refused
+    assert (refused.num_samples, refused.reason[:21]) == (8, "image of another size")

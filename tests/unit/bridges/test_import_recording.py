@@ -12,6 +12,7 @@ from dextouch.bridges.import_recording import (
     ForeignStream,
     ImportAttributes,
     Refused,
+    find_format,
     new_attributes,
     stream_names,
     write_recording,
@@ -101,6 +102,22 @@ def test_an_import_is_whole_or_not_at_all(tmp_path: Path) -> None:
     # Not written by older releases, and absent from recordings that were not imported.
     plain = attributes.model_copy(update={"imported_from": None})
     assert "imported_from" not in plain.model_dump()
+
+
+@pytest.mark.parametrize(
+    ("start", "advice"),
+    [
+        (b"#ROSBAG V2.0", "rosbags-convert"),
+        (b"SQLite format 3\0", "rosbags-convert"),
+        (b"version https://git-lfs.github.com/spec/v1", "git lfs pull"),
+        (bytes.fromhex("28b52ffd"), "zstd -d"),
+        (b"\x89HDF", r"89 48 44 46; expected"),
+    ],
+)
+def test_files_of_other_kinds_say_what_to_do(tmp_path, start, advice) -> None:
+    (tmp_path / "a").write_bytes(start)
+    with pytest.raises(InvalidInputError, match=advice):
+        find_format(tmp_path / "a")
 
 
 def test_names_follow_the_rule() -> None:

@@ -102,6 +102,10 @@ def test_the_timeline_is_chosen(store, tmp_path):
     path = rrd(tmp_path / "none.rrd", ())
     report = import_rrd(path, store, ImportAttributes())
     assert abs(report.imported[0].duration_s) < 60
+    assert ("frame", "timeline") in [(one.source, one.schema) for one in report.refused]
+    rr.RecordingStream("lab").save(tmp_path / "empty.rrd")
+    with pytest.raises(InvalidInputError, match="nothing that was logged at a time"):
+        import_rrd(tmp_path / "empty.rrd", store, ImportAttributes())
 
 
 def test_an_export_of_ours_comes_back_as_numbers(store, tmp_path):
@@ -161,6 +165,24 @@ def test_components_that_rows_leave_out_are_the_newest_in_time(store, tmp_path):
     assert [(one.source, one.num_samples) for one in report.refused] == [("/image", 2)]
 
 
+def test_parts_that_a_row_clears_have_their_defaults_and_whole_numbers_are_exact(store, tmp_path):
+    """Every call of Transform3D up to Rerun 0.23 clears the parts that it leaves out."""
+    stream = saved(tmp_path / "a.rrd")
+    at(stream, 0)
+    turned = rr.Quaternion(xyzw=[0, 0, 0.6, 0.8])
+    stream.log("hand", rr.Transform3D.from_fields(clear_unset=True, quaternion=turned))
+    at(stream, 1)
+    stream.log("hand", rr.Transform3D.from_fields(clear_unset=True, translation=[1, 2, 3]))
+    stream.log("stamp", rr.AnyValues(ns=T0 + 1))
+    stream.log("big", rr.AnyValues(big=np.array([2**63], dtype=np.uint64)))
+    stream.disconnect()
+    report = import_rrd(tmp_path / "a.rrd", store, ImportAttributes())
+    assert store.recording("a").values("stamp", 0, 1).tolist() == [[T0 + 1]]
+    poses = store.recording("a").values("hand", 0, 2)
+    np.testing.assert_allclose(poses, [[0, 0, 0, 0.8, 0, 0, 0.6], [1, 2, 3, 1, 0, 0, 0]], atol=1e-6)
+    assert [one.source for one in report.refused] == ["/big"]
+
+
 def test_what_is_left_out_is_said(store, tmp_path):
     for name in ("first", "second"):
         stream = saved(tmp_path / f"{name}.rrd", name)
@@ -168,6 +190,7 @@ def test_what_is_left_out_is_said(store, tmp_path):
             at(stream, k)
             stream.log("cam", rr.Pinhole(focal_length=50, width=6, height=4, camera_xyz=VIEW))
             stream.log("cam", rr.Image(np.full((4, 6, 3), k, np.uint8)))
+            stream.log("other", rr.Pinhole(focal_length=99, width=6, height=4))
             stream.log("deep", rr.DepthImage(np.full((4, 6), k, np.uint16), meter=1000.0))
             stream.log("points", rr.Points3D([[0, 0, 1]], labels=["a"]))
         stream.disconnect()
@@ -181,11 +204,14 @@ def test_what_is_left_out_is_said(store, tmp_path):
     report = import_rrd(both, store, ImportAttributes(mapping={"camera_head": "/cam"}))
     K = store.recording("both").attributes.calibration["K_head"]
     assert K == ((50, 0, 3), (0, 50, 2), (0, 0, 1))
+    # A pinhole is of its entity and of those below, not of others beside it.
+    assert "K_deep" not in store.recording("both").attributes.calibration
     notes = {one.source: one.notes for one in report.imported}
     assert "1000 are one metre" in notes["/deep"][0]
     assert notes["/points"] == ("left out: labels",)
     reasons = {one.source: one.reason for one in report.refused}
     assert reasons["/cam"] == "left out: camera_xyz"
+    assert reasons["/other"] == "no images of (4, 6) pixels at or below it"
     assert "only the first, 'first', is imported" in reasons["second"]
 
 

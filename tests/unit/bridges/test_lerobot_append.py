@@ -21,7 +21,14 @@ from dextouch.bridges.lerobot import (
 )
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import ConflictError, CorruptDataError, InvalidInputError, StorageError
-from tests.unit.bridges.lerobot_edits import INFO, STATS, edit_json
+from tests.unit.bridges.lerobot_edits import (
+    EPISODES,
+    INFO,
+    STATS,
+    edit_column,
+    edit_json,
+    set_item,
+)
 from tests.unit.bridges.lerobot_episodes import make_episode
 from tests.unit.bridges.lerobot_structure import problems
 
@@ -122,12 +129,18 @@ def _other_splits(folder, _):
     return APPEND, "splits"
 
 
+def _holes(folder, _):
+    edit_column(folder, EPISODES, "episode_index", set_item(0, 2))
+    return APPEND, "total_episodes 1, expected 3"
+
+
 def _touch(folder, _):
     return ExportOptions(touch_samples=True, existing="append"), "--touch-samples"
 
 
 @pytest.mark.parametrize(
-    "change", [_other_rate, _fewer_cameras, _other_codec, _other_shape, _other_splits, _touch]
+    "change",
+    [_other_rate, _fewer_cameras, _other_codec, _other_shape, _other_splits, _holes, _touch],
 )
 def test_what_does_not_fit_is_refused_and_the_dataset_stays(store, folder, change):
     export_dataset([episode(store, 3)], folder, repo_id="lab/touch")

@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import os
 import shutil
 
 import numpy as np
@@ -287,6 +288,34 @@ def test_paths_stay_in_the_folder(tmp_path):
     for path in ("..", "a/../../b", "/etc/passwd"):
         with pytest.raises(CorruptDataError, match="leads out"):
             confined(tmp_path, path)
+
+
+def test_a_snapshot_in_the_cache_of_the_hub_is_whole_with_its_blobs(folder, store, tmp_path):
+    """The layout that `huggingface_hub.snapshot_download` leaves: links to files beside it."""
+    repository = tmp_path / "datasets--lab--touch"
+    snapshot, blobs = repository / "snapshots" / "1a2b3c", repository / "blobs"
+    blobs.mkdir(parents=True)
+    for number, path in enumerate(sorted(p for p in folder.rglob("*") if p.is_file())):
+        link = snapshot / path.relative_to(folder)
+        link.parent.mkdir(parents=True, exist_ok=True)
+        blob = path.rename(blobs / f"{number:064x}")
+        link.symlink_to(os.path.relpath(blob, link.parent))
+    assert import_dataset(snapshot, store).ids
+    (tmp_path / "secret").write_text("{}")
+    for place in (tmp_path / "secret", repository / "secret"):
+        (snapshot / INFO).unlink()
+        (snapshot / INFO).symlink_to(place)
+        with pytest.raises(CorruptDataError, match="leads out"):
+            import_dataset(snapshot, store)
+
+
+def test_a_pointer_of_lfs_says_how_to_get_the_file(folder, store):
+    for name in (DATA, next(folder.rglob("*.mp4")).relative_to(folder)):
+        whole = (folder / name).read_bytes()
+        (folder / name).write_text("version https://git-lfs.github.com/spec/v1\nsize 1\n")
+        with pytest.raises(CorruptDataError, match="`git lfs pull`"):
+            import_dataset(folder, store)
+        (folder / name).write_bytes(whole)
 
 
 def test_a_feature_of_a_video_cannot_leave_by_its_name(folder, store):

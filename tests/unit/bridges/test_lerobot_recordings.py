@@ -288,6 +288,40 @@ def test_what_contradicts_the_rows_is_refused_and_leaves_nothing(store, tmp_path
 
 
 @pytest.mark.parametrize("version", WRITERS)
+def test_episodes_with_holes_or_out_of_order_keep_their_numbers(store, tmp_path, version):
+    made, folder = written(tmp_path, version)
+    tables = folder / "meta/episodes/chunk-000"
+    if version == "v3.0":
+        rows = pq.read_table(tables / "file-000.parquet")
+        # Whole numbers, as pandas writes them where all of a column are.
+        places = rows.column_names.index(f"videos/{TOP}/from_timestamp")
+        rows = rows.set_column(places, f"videos/{TOP}/from_timestamp", pa.array([0, 0]))
+        pq.write_table(rows.slice(1), tables / "file-000.parquet")
+        pq.write_table(rows.slice(0, 1), tables / "file-001.parquet")
+        assert import_dataset(folder, store).ids == ["arm-000000", "arm-000001"]
+        (tables / "file-001.parquet").unlink()
+    else:
+        path = folder / "meta/episodes.jsonl"
+        path.write_text(path.read_text().split("\n", 1)[1])
+    edit_json(folder, INFO, lambda i: i.update(total_episodes=1, total_frames=LENGTHS[1]))
+    result = import_dataset(folder, store, options=ImportOptions(id_prefix="b-"))
+    assert result.ids == ["b-arm-000001"]
+    assert "of the episodes 0 … 1 there are 1" in result.reports[0].contradictions
+    np.testing.assert_array_equal(
+        values(store.recording("b-arm-000001"), "action"), np.float32(made.values["action"][1])
+    )
+
+
+def test_columns_that_are_not_declared_are_named(store, tmp_path):
+    _, folder = written(tmp_path)
+    undeclared = ("timestamp", "index", "task_index")
+    edit_json(folder, INFO, lambda i: [i["features"].pop(name) for name in undeclared])
+    report = import_dataset(folder, store).reports[0]
+    assert [one.source for one in report.refused] == [*undeclared]
+    assert report.contradictions == ["episode 0 has no timestamps"]
+
+
+@pytest.mark.parametrize("version", WRITERS)
 def test_one_bad_episode_does_not_stop_the_others_and_can_be_made_good(store, tmp_path, version):
     _, folder = written(tmp_path, version)
     name = DATA if version == "v3.0" else "data/chunk-000/episode_000000.parquet"

@@ -27,7 +27,7 @@ store backup, store clicks, store delete, store deletions, store enrol, store li
 store note, store purge, store relabel, store repair, store restore, store restore-backup,
 store revoke, store serve, store show, store stations, store trim, store verify,
 study report, study run, study serve, teleop serve,
-train adapt, train data, train distill, train imagined, train judge, train policy,
+train adapt, train cache, train data, train distill, train imagined, train judge, train policy,
 train tokenizer, train world-model,
 twin record, twin serve, up
 """

@@ -191,6 +191,12 @@ def test_a_folder_of_two_formats_needs_a_choice(dextouch, tmp_path):
     status, _, err = dextouch("import", tmp_path)
     assert status
     assert "choose one with --format" in err
+    # Names in capitals are of the format, too; those of operating systems are not.
+    (tmp_path / "a.mcap").rename(tmp_path / "A.MCAP")
+    (tmp_path / "._b.mcap").write_bytes(b"")
+    _, _, err = dextouch("import", "--format", "mcap", tmp_path)
+    assert "A.MCAP: is not an MCAP file" in err
+    assert "choose one" in dextouch("import", tmp_path)[2]
 
 
 def test_what_was_rejected_in_review_is_left_out_unless_it_is_asked_for(store, dextouch, tmp_path):
@@ -427,3 +433,29 @@ def test_help_teaches_with_examples(word, capsys):
     text = capsys.readouterr().out
     assert f"dextouch {word} --format mcap" in text
     assert "lerobot" in text
+
+
+def test_a_rerun_file_that_ends_its_reader_is_an_error(dextouch, tmp_path):
+    rr = pytest.importorskip("rerun")
+    for name in ("a", "b"):
+        stream = rr.RecordingStream("lab")
+        stream.save(tmp_path / f"{name}.rrd")
+        for k in range(3):
+            stream.set_time("camera", timestamp=np.datetime64(1_700_000_000 + k, "s"))
+            stream.log("glove", rr.AnyValues(pressure=[1.0 * k]))
+        stream.disconnect()
+    # Rust panics at a zero byte in a name where it cannot unwind.
+    path = tmp_path / "a.rrd"
+    path.write_bytes(path.read_bytes().replace(b"pressure", b"pre\0sure", 1))
+    status, _, err = dextouch("import", path)
+    assert status == main.EXIT_REFUSED
+    assert "a.rrd: rerun-sdk ended its process" in err
+    folder = tmp_path / "both"
+    folder.mkdir()
+    for name in ("a", "b"):
+        (tmp_path / f"{name}.rrd").rename(folder / f"{name}.rrd")
+    status, out, err = dextouch("import", folder)
+    assert status == 3
+    assert "glove" in out
+    assert "a.rrd: not imported" in err
+    assert EpisodeStore(tmp_path / "store").recording("b").values("glove", 2, 3).tolist() == [[2]]

@@ -10,12 +10,16 @@ import sys
 import threading
 import time
 from contextlib import closing
+from datetime import UTC, datetime
 
 import pytest
 from structlog.testing import capture_logs
 
 from dextouch.episodes import EpisodeStore
+from dextouch.episodes.bucket_storage import ORPHAN_AGE, sweep_orphans, upload_group
 from dextouch.episodes.maintenance import DeletionRequest, delete_for_good
+from dextouch.episodes.s3_bucket import Bucket
+from dextouch.errors import StorageError
 from dextouch.schemas import Review
 from services.episode_store import catalog_file, catalog_index, command_line
 from services.episode_store.catalog import Catalog
@@ -302,36 +306,69 @@ def s3_server():
         yield server
 
 
-def test_a_bucket_is_listed_by_ids(s3_server, tmp_path, monkeypatch):
-    """The second look takes a request per kind and thousand ids, not one per item."""
-    options = CREDENTIALS | {"work_folder": str(tmp_path / "work")}
-    store = EpisodeStore(s3_server.url(f"catalog/{tmp_path.name}"), options)
-    bucket = store._storage._bucket
-    local = EpisodeStore(tmp_path / "local")
-    names = [f"e-{number:03d}" for number in range(30)]
-    for name in names:
-        put_item(local, "episode", name)
-        for file in ("zarr.json", "commit.json"):
-            path = local.root / "episodes" / name / file
-            bucket.put(f"episodes/{name}/{file}", path.read_bytes())
-    assert ids(Catalog(store)) == names
-    asked = []
+@pytest.fixture
+def in_bucket(s3_server, tmp_path):
+    """A function that opens a store in a bucket, as the programs of one computer do."""
+
+    def opened(computer):
+        options = CREDENTIALS | {"work_folder": str(tmp_path / computer)}
+        return EpisodeStore(s3_server.url(f"catalog/{tmp_path.name}"), options)
+
+    return opened
+
+
+@pytest.fixture
+def now_ns(monkeypatch):
+    """The clock by which a bucket is looked at again; its first value can be changed."""
+    now_ns = [time.monotonic_ns()]
+    monkeypatch.setattr(catalog_index.time, "monotonic_ns", lambda: now_ns[0])
+    return now_ns
+
+
+def requests_of(store, monkeypatch):
+    """What is asked of the bucket from now on."""
+    bucket, asked = store._storage._bucket, []
     for method in ("get", "head", "tail", "list", "folders"):
         whole = getattr(bucket, method)
         monkeypatch.setattr(
             bucket, method, lambda key, *args, _f=whole: asked.append(key) or _f(key, *args)
         )
+    return asked
+
+
+def upload_item(store, kind, name, **changes):
+    """Commit an item to a bucket, by the upload that ends every writer."""
+    local = EpisodeStore(store.root / "local")
+    put_item(local, kind, name, **changes)
+    upload_group(store._storage._bucket, kind, local.root / f"{kind}s" / name)
+
+
+def put_as_before(store, names, folder):
+    """Put episodes into a bucket as releases did that announced no changes."""
+    local = EpisodeStore(folder)
+    for name in names:
+        put_item(local, "episode", name)
+        for file in ("zarr.json", "commit.json"):
+            path = local.root / "episodes" / name / file
+            store._storage._bucket.put(f"episodes/{name}/{file}", path.read_bytes())
+
+
+def test_a_bucket_of_an_earlier_release_is_listed_by_ids(in_bucket, tmp_path, monkeypatch, now_ns):
+    """The second look takes a request per kind and thousand ids, not one per item."""
+    store = in_bucket("work")
+    names = [f"e-{number:03d}" for number in range(30)]
+    put_as_before(store, names, tmp_path / "local")
+    assert ids(Catalog(store)) == names
+    bucket, asked = store._storage._bucket, requests_of(store, monkeypatch)
     catalog = Catalog(store)
     assert ids(catalog) == names
-    assert asked == ["episodes", "recordings"]
-    now_ns = [time.monotonic_ns()]
-    monkeypatch.setattr(catalog_index.time, "monotonic_ns", lambda: now_ns[0])
+    assert asked == [".changes", "episodes", "recordings"]
     bucket.remove([f"episodes/e-007/{file}" for file in ("commit.json", "zarr.json")])
     assert ids(catalog) == names
     asked.clear()
     now_ns[0] += catalog_index.BUCKET_PERIOD_NS
     assert ids(catalog) == [name for name in names if name != "e-007"]
-    assert asked == ["episodes", "recordings"]
+    assert asked == [".changes", "episodes", "recordings"]
     # A check finds what a list of ids does not.
     review = json.dumps(REJECTED.model_dump(mode="json")).encode()
     bucket.put("episodes/e-003/review.json", review)
@@ -339,3 +376,92 @@ def test_a_bucket_is_listed_by_ids(s3_server, tmp_path, monkeypatch):
     assert [one.id for one in catalog.items(ItemFilter(review="rejected"), limit=9).items] == [
         "e-003"
     ]
+
+
+def test_changes_of_a_bucket_are_found_without_listing_it(in_bucket, tmp_path, monkeypatch, now_ns):
+    ours, theirs = in_bucket("ours"), in_bucket("theirs")
+    for name in ("a", "b", "c"):
+        upload_item(theirs, "episode", name)
+    catalog, asked = Catalog(ours), requests_of(ours, monkeypatch)
+
+    def found(**wanted):
+        asked.clear()
+        now_ns[0] += catalog_index.BUCKET_PERIOD_NS
+        return [one.id for one in catalog.items(ItemFilter(**wanted), limit=9).items]
+
+    assert found() == ["a", "b", "c"]
+    assert found() == ["a", "b", "c"]
+    assert asked == [".changes"]
+    upload_item(theirs, "episode", "d")
+    upload_item(theirs, "recording", "r")
+    assert found() == ["a", "b", "c", "d", "r"]
+    assert not {"episodes", "recordings"} & set(asked)
+    assert not [key for key in asked if "/a" in key]
+    theirs.set_review("b", REJECTED)
+    assert found(review="rejected") == ["b"]
+    theirs.set_review("b", None)
+    theirs.delete("c")
+    assert (found(), found(review="rejected")) == (["a", "b", "d", "r"], [])
+    theirs.delete("a")
+    upload_item(theirs, "episode", "a", task="other")
+    assert found(task="other") == ["a"]
+    # Another process of this computer reads on where this one ended.
+    catalog = Catalog(ours)
+    assert (found(), asked) == (["a", "b", "d", "r"], [".changes"])
+    # What an earlier release commits is found by the list that follows.
+    put_as_before(theirs, ["e"], tmp_path / "local")
+    assert found() == ["a", "b", "d", "r"]
+    later_s = time.time() + catalog_index.BUCKET_CHECK_PERIOD_S
+    monkeypatch.setattr(catalog_index.time, "time", lambda: later_s)
+    assert found() == ["a", "b", "d", "e", "r"]
+    assert "episodes" in asked
+
+
+def test_the_last_change_of_a_bucket_stays(in_bucket):
+    store = in_bucket("work")
+    upload_item(store, "episode", "a")
+    time.sleep(1.1)  # what the server rounds times to
+    upload_item(store, "episode", "b")
+    assert sorted(store.changes().values()) == [("episode", "a"), ("episode", "b")]
+    sweep_orphans(store._storage._bucket, now=datetime.now(UTC) + 2 * ORPHAN_AGE)
+    assert list(store.changes().values()) == [("episode", "b")]
+    assert store.list() == ["a", "b"]
+
+
+def test_an_item_that_cannot_be_read_is_looked_at_by_other_processes(
+    in_bucket, monkeypatch, now_ns
+):
+    store = in_bucket("work")
+    upload_item(store, "episode", "a")
+    catalog = Catalog(store)
+    assert ids(catalog) == ["a"]
+    upload_item(store, "episode", "b")
+    now_ns[0] += catalog_index.BUCKET_PERIOD_NS
+    with monkeypatch.context() as broken, capture_logs() as logs:
+        failure = StorageError("read: no answer")
+        broken.setattr(store, "open", lambda _: (_ for _ in ()).throw(failure))
+        assert ids(catalog) == ["a"]
+    assert [entry["id"] for entry in logs] == ["b"]
+    assert ids(Catalog(store)) == ["a", "b"]
+
+
+def test_a_bucket_whose_policy_allows_items_alone(in_bucket, monkeypatch, now_ns):
+    ours, theirs = in_bucket("ours"), in_bucket("theirs")
+    for method in ("put", "list"):
+        whole = getattr(Bucket, method)
+
+        def refused(self, key, *args, _f=whole, **options):
+            if key.startswith(".changes"):
+                raise StorageError(f"write {key}: refused (403 AccessDenied)")
+            return _f(self, key, *args, **options)
+
+        monkeypatch.setattr(Bucket, method, refused)
+    with capture_logs() as logs:
+        upload_item(theirs, "episode", "a")
+    assert [entry["event"] for entry in logs] == ["change_not_announced"]
+    catalog = Catalog(ours)
+    assert ids(catalog) == ["a"]
+    upload_item(theirs, "episode", "b")
+    now_ns[0] += catalog_index.BUCKET_PERIOD_NS
+    assert ids(catalog) == ["a", "b"]
+    assert ours.sweep() == 0

@@ -169,6 +169,8 @@ def test_the_claim_comes_first_and_the_commit_record_last(store, monkeypatch, ma
     monkeypatch.setattr(Bucket, "put", noted)
     made.write(store)
     assert puts[0] == ("claim", True)
+    # Catalogs hear of it when everybody can see it.
+    assert puts.pop()[0].startswith(f".changes/episodes/{EPISODE}/")
     assert puts[-1] == ("commit.json", True)
     assert [name for name, _ in puts].count("commit.json") == 1
     # Claimed once more before the commit, in case a sweep took the upload for dead.

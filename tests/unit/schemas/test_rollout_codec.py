@@ -27,7 +27,7 @@ from dextouch.schemas import (
     encode_start,
     rollout_uncertainty,
 )
-from dextouch.schemas.observations import check_observation_arrays
+from dextouch.schemas.observations import ObservationFields, check_observation_arrays
 from dextouch.streams import pack, unpack
 from tests.unit.worlds.fakes import CAMERAS, K_HEAD, anchor, observation
 
@@ -223,6 +223,30 @@ def test_the_state_of_a_rollout_carries_its_doubt():
     assert (later.next_chunk, later.last_step) == (INFO.next_chunk + 3, INFO.last_step + 16)
     answer = decode_answer(encode_answer(later, observation(4)), max_bytes=10**6)
     assert answer.rollout == later
+
+
+@pytest.mark.parametrize("success", [None, True, False])
+def test_fields_are_those_of_their_schema(success):
+    for seen in (golden_observation(), imagined_observation()):
+        one = dataclasses.replace(seen, success=success)
+        by_pydantic = ObservationFields.model_validate(one, from_attributes=True)
+        fields, _ = answer_parts(INFO, one)
+        assert fields["observation"] == by_pydantic.model_dump(mode="json")
+
+
+def test_the_last_step_keeps_what_is_of_the_whole_chunk():
+    seen = dataclasses.replace(imagined_observation(), success=True)
+    assert_same(
+        seen.last(),
+        dataclasses.replace(
+            seen,
+            first_step=seen.first_step + 1,
+            images={camera: images[1:] for camera, images in seen.images.items()},
+            tactile_kpa=seen.tactile_kpa[1:],
+            action_reached=seen.action_reached[1:],
+            object_poses=seen.object_poses[1:],
+        ),
+    )
 
 
 def test_last_step_and_one_camera():

@@ -137,3 +137,29 @@ def test_mounts_come_before_the_judgement():
 
     tracked = {name: to_body(of) if name == "head" else of for name, of in poses.items()}
     assert found(tracked, to_body={"head": to_body}) is None
+
+
+@pytest.mark.parametrize("lag_rad", [0.02, 0.1, 0.3])
+def test_conjugates_of_a_robot_s_wrist_are_known_by_its_command(lag_rad):
+    for seed in range(20):
+        poses = person(seed)
+        for name in NAMES[1:]:
+            behind = Rotation.from_rotvec([0, lag_rad, 0]) * Rotation.from_quat(
+                poses[name][:, [4, 5, 6, 3]]
+            )
+            quaternions = behind.as_quat()[:, [3, 0, 1, 2]]
+            poses[f"{name}_commanded"] = np.hstack([poses[name][:, :3], quaternions])
+        assert found(poses, of_robot=True) is None
+        poses["wrist_left"] = poses["wrist_left"] * [1, 1, 1, 1, -1, -1, -1]
+        stream, cause, message = found(poses, of_robot=True)
+        assert (stream, cause) == ("wrist_left", "quaternion_order")
+        assert "conjugates" in message
+
+
+def test_a_robot_s_wrist_that_never_moves_though_it_is_commanded():
+    for seed in range(20):
+        poses = person(seed)
+        poses |= {f"{name}_commanded": poses[name] for name in NAMES[1:]}
+        noise = 1e-3 * np.random.default_rng(seed).standard_normal((600, 7))
+        still = poses["wrist_right"][:1] + noise * ([1] * 3 + [0] * 4)
+        assert found(poses | {"wrist_right": still}, of_robot=True)[:2] == ("wrist_right", "frozen")

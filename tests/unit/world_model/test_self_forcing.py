@@ -157,15 +157,18 @@ def test_a_checkpoint_is_distilled_and_an_interrupted_run_goes_on(
 
 
 @pytest.mark.long
+@pytest.mark.parametrize("objective", ["self_forcing", "consistency"])
 def test_the_command_takes_the_network_from_the_checkpoint(
-    toy_store, train_settings, tmp_path, capsys
+    toy_store, train_settings, tmp_path, objective
 ):
     settings = train_settings.model_copy(update={"max_steps": 1, "heldout_percent": 50})
     teacher = train(settings)
     output = tmp_path / "few.safetensors"
     flags = ["--init", str(teacher.checkpoint), "--steps", "1", "--output", str(output)]
     flags += ["--episodes", str(toy_store.root), "--max-steps", "1", "--heldout-percent", "50"]
+    flags += ["--objective", objective]
     assert run_distill([*flags, "--optimizer.batch", "2"]) == 0
     metadata = read_checkpoint(output).metadata
     assert metadata.network == settings.network.model_copy(update={"sampling_steps": 1})
     assert "--self-forcing" in metadata.command
+    assert ("--consistency" in metadata.command) == (objective == "consistency")

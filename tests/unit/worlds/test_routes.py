@@ -121,7 +121,12 @@ async def test_metrics_tell_parts_and_batches(client):
     for part in ("decode", "queue", "device", "encode", "store"):
         labels = f'{{part="{part}",route="{route}"}}'
         assert f"dextouch_http_part_seconds_count{labels} 1.0" in text
-    assert 'dextouch_batch_rollouts_bucket{le="1.0",world="sum"} 1.0' in text
+    for name in (
+        'bucket{le="1.0",world="sum"}',
+        'bucket{le="+Inf",world="sum"}',
+        'sum{world="sum"}',
+    ):
+        assert f"dextouch_batch_rollouts_{name} 1.0" in text
 
 
 async def test_the_selector_narrows_the_answer(client):

@@ -49,6 +49,7 @@ class ExistingDataset:
             "data_path": layout.DATA_PATH,
             "chunks_size": layout.CHUNK_FILES,
             "splits": {"train": f"0:{len(source.episodes)}"},
+            "total_episodes": max((one.index for one in source.episodes), default=-1) + 1,
         }
         for key, value in expected.items():
             if info.get(key) != value:

@@ -179,14 +179,19 @@ def numbered_path(folder: Path, template: str, number: int, **values: str) -> Pa
 
 
 def confined(folder: Path, relative: str) -> Path:
-    """Resolve a path below `folder`, following links; raises CorruptDataError if it leads out."""
+    """A path below `folder`, following links; raises CorruptDataError if it leads out.
+
+    Links of a snapshot in the cache of the Hub may lead to the blobs of its repository.
+    """
     root = folder.resolve()
     if "\0" in relative:
         raise CorruptDataError(f"{folder}: got a path with a zero byte")
     path = (root / relative).resolve()
-    if not path.is_relative_to(root):
-        raise CorruptDataError(f"{folder}: path {relative!r} leads out of the dataset; refused")
-    return path
+    if path.is_relative_to(root):
+        return path
+    if root.parent.name == "snapshots" and path.parent == root.parents[1] / "blobs":
+        return root / relative
+    raise CorruptDataError(f"{folder}: path {relative!r} leads out of the dataset; refused")
 
 
 @dataclass(frozen=True)

@@ -247,16 +247,15 @@ def _image_stream(
     read = partial(frames.source.images, frames.entry, key)
     form, dtype, shape, _ = compressed_form(next(read()))
     declared = frames.feature(key).numbers()
+    where = f"{frames.source.folder}: episode {frames.entry.index}: {key!r}"
     if shape[:2] != declared[:2]:
         raise CorruptDataError(
-            f"{frames.source.folder}: episode {frames.entry.index}: {key!r} has images of "
-            f"{list(shape)}, info.json declares {list(declared)}"
+            f"{where} has images of {list(shape)}, info.json declares {list(declared)}"
         )
     stored = form if unit is None or len(shape) < 3 else unit
     keeps = form == stored and stored in ENCODED_UNITS
     descriptor = _descriptor(frames, name, "image", shape=shape, dtype=dtype, unit=stored)
     fresh = np.diff(stamps_ns, prepend=stamps_ns[0] - 1) > 0
-    where = f"{frames.source.folder}: episode {frames.entry.index}: {key!r}"
 
     def blocks() -> Iterator[Block]:
         encoded = _same_form(read(), (form, dtype, shape), where)
@@ -388,7 +387,9 @@ def frame_times(
         ]
     said_s = source.numbers(entry, "timestamp").astype(np.float64)
     if not np.isfinite(said_s).all() or np.abs(said_s).max() > 1e9:
-        raise CorruptDataError(f"{where}: timestamp is not a time in seconds")
+        raise CorruptDataError(
+            f"{where}: timestamp goes to {np.abs(said_s).max():g}, expected seconds; see --fps RATE"
+        )
     if (np.diff(said_s) <= 0).any():
         raise CorruptDataError(
             f"{where}: timestamp does not rise from frame to frame; --fps RATE takes the frames' "
@@ -412,6 +413,8 @@ def dataset_contradictions(source: LeRobotFolder) -> list[str]:
     """What `meta/` says of a dataset and its files do not hold, or say otherwise."""
     info, problems = source.info, []
     num_frames = sum(entry.length for entry in source.episodes)
+    if source.episodes and (last := source.episodes[-1].index) >= len(source.episodes):
+        problems.append(f"of the episodes 0 … {last} there are {len(source.episodes)}")
     if info.total_frames not in {None, num_frames}:
         problems.append(
             f"info.json says {info.total_frames} frames, the episodes have {num_frames}"
@@ -435,7 +438,7 @@ def dataset_contradictions(source: LeRobotFolder) -> list[str]:
 
 def _episode_contradictions(source: LeRobotFolder, entry: EpisodeEntry) -> Iterator[str]:
     rows = source.rows(entry)
-    if TASK_INDEX in rows.column_names and source.tasks:
+    if TASK_INDEX in source.info.features and source.tasks:
         numbers = np.unique(source.numbers(entry, TASK_INDEX)).tolist()
         texts = {source.tasks.get(number, f"task {number}") for number in numbers}
         if texts != {*entry.tasks}:

@@ -13,6 +13,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from dextouch.bridges.import_recording import remedy
 from dextouch.bridges.lerobot import layout
 from dextouch.bridges.lerobot.video import VideoSpan
 from dextouch.data_folder import is_system_file
@@ -272,13 +273,13 @@ class LeRobotFolder:
             path = self._path(self.info.video_path, entry, "", video_key=key)
             return VideoSpan(path, 0.0, entry.length, self.info.fps, shape)
         start = entry.row.get(f"videos/{key}/from_timestamp")
-        if not isinstance(start, float) or not 0 <= start < 1e9:
+        if not isinstance(start, int | float) or not 0 <= start < 1e9:
             raise CorruptDataError(
                 f"{self.folder}: episode {entry.index} does not specify where {key!r} "
                 f"begins ({start})"
             )
         path = self._path(self.info.video_path, entry, f"videos/{key}", video_key=key)
-        return VideoSpan(path, start, entry.length, self.info.fps, shape)
+        return VideoSpan(path, float(start), entry.length, self.info.fps, shape)
 
     def _path(self, template: str, entry: EpisodeEntry, prefix: str, **values: str) -> Path:
         if self.info.has_file_per_episode:
@@ -433,25 +434,26 @@ def _episode_rows(folder: Path, info: DatasetInfo) -> Iterator[dict[str, Any]]:
 def _read_episodes(
     folder: Path, info: DatasetInfo, tasks: dict[int, str]
 ) -> tuple[EpisodeEntry, ...]:
-    entries: list[EpisodeEntry] = []
+    entries: dict[int, EpisodeEntry] = {}
     for row in _episode_rows(folder, info):
         index, length = row.get("episode_index"), row.get("length")
         if not isinstance(index, int) or not isinstance(length, int):
             raise CorruptDataError(f"{folder}: an episode has no index or no length ({row})")
-        if index != len(entries) or not 1 <= length <= MAX_EPISODE_FRAMES:
+        is_new = 0 <= index < MAX_EPISODES and index not in entries
+        if not is_new or not 1 <= length <= MAX_EPISODE_FRAMES:
             raise CorruptDataError(
-                f"{folder}: got episode {index} of {length} frames, expected episode "
-                f"{len(entries)} of 1 … {MAX_EPISODE_FRAMES} frames"
+                f"{folder}: got episode {index} of {length} frames, expected every episode once, "
+                f"of 1 … {MAX_EPISODE_FRAMES} frames"
             )
         said = row.get("tasks") or list(tasks.values())[:1] or [""]
         texts = tuple(map(whole_text, said if isinstance(said, list) else [said]))
-        entries.append(EpisodeEntry(index, length, texts, row))
+        entries[index] = EpisodeEntry(index, length, texts, row)
     if len(entries) != info.total_episodes:
         raise CorruptDataError(
             f"{folder}: table lists {len(entries)} episodes, info.json says {info.total_episodes}; "
             "the dataset was not finished"
         )
-    return tuple(entries)
+    return tuple(entries[index] for index in sorted(entries))
 
 
 def _read_table(
@@ -486,7 +488,7 @@ def _read_table(
             return pa.concat_tables(tables) if tables else file.read(columns=wanted)
     except (pa.ArrowException, OSError, UnicodeError) as error:
         raise CorruptDataError(
-            f"{path}: is not a complete parquet file ({error}); copy the dataset again"
+            f"{path}: is not a complete parquet file ({error}); {remedy(path)}"
         ) from error
 
 

@@ -15,6 +15,7 @@ from av.container import InputContainer, OutputContainer
 from av.video.stream import VideoStream
 from jaxtyping import UInt8
 
+from dextouch.bridges.import_recording import remedy
 from dextouch.bridges.lerobot.layout import VIDEO_FILE_MB, VIDEO_PATH, numbered_path
 from dextouch.episodes import (
     EpisodeReader,
@@ -212,7 +213,7 @@ def _opened(span: VideoSpan) -> Iterator[tuple[InputContainer, VideoStream]]:
             yield container, stream
     except (av.error.FFmpegError, ValueError) as error:
         raise CorruptDataError(
-            f"{span.path}: is not a complete mp4 file ({error}); copy the dataset again"
+            f"{span.path}: is not a complete mp4 file ({error}); {remedy(span.path)}"
         ) from error
 
 
@@ -254,7 +255,8 @@ def _in_place(
 def _missing(span: VideoSpan, done: int, place: int) -> CorruptDataError:
     return CorruptDataError(
         f"{span.path}: image {done} of {span.count} after {span.from_s:.3f} s is missing "
-        f"(the next one is {place}); copy the dataset again"
+        f"(the next one is {place}); copy the dataset again, or correct its fps ({span.fps:g}) if "
+        "the video has another rate"
     )
 
 

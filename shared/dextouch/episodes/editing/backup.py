@@ -15,6 +15,7 @@ from dextouch.episodes import maintenance
 from dextouch.episodes.editing.merge import copy_item, deletion_of
 from dextouch.episodes.files import LocalGroup, disk_errors, held_folder, replace_file
 from dextouch.episodes.format import COMMIT_FILE, KINDS, Kind, stated_sha256
+from dextouch.episodes.staging import CATALOG_FOLDER
 from dextouch.episodes.store import EpisodeStore
 from dextouch.episodes.trash import remove_for_good
 from dextouch.errors import (
@@ -267,7 +268,7 @@ class _Backup:
                         self._note(BackupReport(entry.kind, entry.item_id, "erased"))
         if any(one.action == "erased" for one in self.reports):
             # A cache, which `store list` may have made here.
-            shutil.rmtree(self.target.root / maintenance.CATALOG_FOLDER, ignore_errors=True)
+            shutil.rmtree(self.target.root / CATALOG_FOLDER, ignore_errors=True)
 
     def _note(self, report: BackupReport, item: BackedUpItem | None = None) -> None:
         if item is not None:

@@ -240,7 +240,6 @@ class _Merge:
                 for name in theirs.superseded_by
                 if (item.kind, name) in self.renamed
             }
-
             if new_ids:
                 results = tuple(new_ids.get(name, name) for name in theirs.superseded_by)
                 ours = theirs.model_copy(update={"superseded_by": results})

@@ -1,8 +1,6 @@
-from .deletion import CATALOG_FOLDER as CATALOG_FOLDER
 from .deletion import DeletionRequest as DeletionRequest
 from .deletion import delete_for_good as delete_for_good
 from .deletion import plan_deletion as plan_deletion
-from .deletion import remove_catalog as remove_catalog
 from .deletion import reviews_by as reviews_by
 from .deletion_records import Covered as Covered
 from .deletion_records import DeletionRecords as DeletionRecords

@@ -31,7 +31,13 @@ from dextouch.episodes.maintenance.item_facts import (
     small_files,
     without_author,
 )
-from dextouch.episodes.staging import DOWNLOADS, sweep_stages
+from dextouch.episodes.staging import (
+    CATALOG_FOLDER,
+    DOWNLOADS,
+    JOURNALS,
+    remove_catalog,
+    sweep_stages,
+)
 from dextouch.episodes.trash import TRASH, put_into_trash, remove_for_good
 from dextouch.errors import CorruptDataError, InvalidInputError, NotFoundError
 from dextouch.free_text import texts_in
@@ -494,18 +500,8 @@ def _read_intent(path: Path, root: Path, request: DeletionRequest) -> _Intent:
         ) from error
 
 
-# Databases of the tables of `services.episode_store`; any other file there is removed as a whole,
-# since the catalog is made anew from the items.
-CATALOG_FOLDER: Final = ".catalog"
 Search = Callable[[str], list[str]]
 _BUSY_S: Final = 10.0
-_JOURNALS: Final = ("-wal", "-shm", "-journal")
-
-
-def remove_catalog(path: Path) -> None:
-    """Remove a database with its journals; processes that have it open do not notice."""
-    for suffix in ("", *_JOURNALS):
-        path.with_name(path.name + suffix).unlink(missing_ok=True)
 
 
 def erase_from_catalog(root: Path, search: Search) -> None:
@@ -579,7 +575,7 @@ def _other_files(root: Path) -> list[Path]:
     folder, found = root / CATALOG_FOLDER, []
     for path in sorted(folder.iterdir()) if folder.is_dir() else []:
         base, dash, _ = path.name.rpartition("-")
-        owner = base if dash and path.name.removeprefix(base) in _JOURNALS else path.name
+        owner = base if dash and path.name.removeprefix(base) in JOURNALS else path.name
         if path.is_file() and not (owner.endswith(".sqlite") and (folder / owner).is_file()):
             found.append(path)
     return found

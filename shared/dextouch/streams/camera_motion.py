@@ -1,0 +1,214 @@
+"""Compares what a camera's pictures show with how the camera moved: still, turned, late, another's.
+
+A picture flows (Lucas and Kanade, 1981, over the whole picture) as its camera turns, and as it
+moves past a scene at one depth, which is unknown. What hands do in the picture is noise here.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int64
+
+from dextouch.geometry import interpolate_poses, invert
+from dextouch.geometry.rotations import rotation_angle
+from dextouch.streams.pictures import COLUMNS, ROWS, apart, noise_levels
+
+# Cameras on tracked bodies, with the stream of the tracker.
+TRACKERS: Final = {
+    "camera_head": "head",
+    "camera_wrist_left": "wrist_left",
+    "camera_wrist_right": "wrist_right",
+}
+_AS_READ: Final = "as they are"
+# How images may be turned or mirrored against their camera's matrix; x is right and y down.
+TURNS: Final[Mapping[str, tuple[tuple[int, int], tuple[int, int]]]] = {
+    _AS_READ: ((1, 0), (0, 1)),
+    "mirrored, left for right": ((-1, 0), (0, 1)),
+    "mirrored, top for bottom": ((1, 0), (0, -1)),
+    "turned by 180 degrees": ((-1, 0), (0, -1)),
+    "turned by 90 degrees clockwise": ((0, -1), (1, 0)),
+    "turned by 90 degrees anticlockwise": ((0, 1), (-1, 0)),
+    "transposed": ((0, 1), (1, 0)),
+    "transposed and turned by 180 degrees": ((0, -1), (-1, 0)),
+}
+# Share of the flow that a reading explains if it is right, and if it is wrong: 0.26 … 0.97 and up
+# to 0.1 in the twin, where both axes move. Readings that explain as much less are as likely.
+RIGHT_SHARE, WRONG_SHARE, MIN_APART = 0.35, 0.1, 0.25
+# Flows are as large as they are predicted, or as near scenes are; chance makes them much smaller.
+MIN_WEIGHT: Final = 0.2
+# Predicted flow of an image, RMS, below which a camera stands still: 0.5 px of VGA at 500 px.
+MIN_FLOW_RAD: Final = 1e-3
+MIN_VIEW_IMAGES: Final = 60
+# Lags that are tried, and what makes one sure: its share of what is left without it, its sigmas,
+# and its size, as cameras without a calibrated latency are as late as an image takes.
+MAX_LAG_S, LAG_STEP_S = 0.4, 0.01
+MIN_GAIN, LAG_SIGMAS, MIN_LAG_S = 0.25, 4.0, 0.035
+NUM_PARTS: Final = 6
+# While a camera turns by so much in a second, or moves past what is a metre away, its picture is
+# off by 30 px of VGA at 500 px, and changes by more than noise does; in so many images at least.
+TURNED_RAD, STILL_NOISE, STILL_SHARE, MIN_TURNED = 0.06, 2.0, 0.9, 15
+_FINE_NS: Final = 10_000_000
+
+
+@dataclass(frozen=True)
+class View:
+    """Pictures of one camera at its times, its matrix for images of (height, width) pixels."""
+
+    t_ns: Int64[np.ndarray, " n"]
+    pictures: Float32[np.ndarray, "n 24 32"]
+    K: Float64[np.ndarray, "3 3"]
+    size_px: tuple[int, int]
+
+    def flow(self) -> Float64[np.ndarray, "steps 2"]:
+        """Mean flow of the picture from image to image, right and down, in focal lengths."""
+        middle = (self.pictures[1:] + self.pictures[:-1]) / 2
+        change = np.diff(self.pictures, axis=0)
+        change = (change - change.mean(axis=(1, 2), keepdims=True))[:, 1:-1, 1:-1]
+        x = (middle[:, 1:-1, 2:] - middle[:, 1:-1, :-2]) / 2
+        y = (middle[:, 2:, 1:-1] - middle[:, :-2, 1:-1]) / 2
+        slopes = np.stack([x, y], axis=-1, dtype=np.float64).reshape(len(change), -1, 2)
+        A = np.swapaxes(slopes, 1, 2) @ slopes
+        # A picture without edges flows nowhere.
+        A += (0.02 * np.trace(A, axis1=1, axis2=2) + 1)[:, None, None] * np.eye(2)
+        b = -np.swapaxes(slopes, 1, 2) @ change.reshape(len(change), -1, 1)
+        (height, width), (focal_x, focal_y) = self.size_px, np.diag(self.K)[:2]
+        blocks = np.linalg.solve(A, b)[..., 0]
+        return np.asarray(blocks * [width / COLUMNS / focal_x, height / ROWS / focal_y])
+
+
+class CameraMotion:
+    """How a camera at poses T_world_camera, two at least, turns and moves, as flow of a picture."""
+
+    def __init__(
+        self, t_ns: Int64[np.ndarray, " m"], Ts_world_camera: Float64[np.ndarray, "m 4 4"]
+    ) -> None:
+        self.t_ns = np.arange(t_ns[0], t_ns[-1], _FINE_NS)
+        left = np.searchsorted(t_ns, self.t_ns, side="right").clip(1, len(t_ns) - 1) - 1
+        weight = (self.t_ns - t_ns[left]) / (t_ns[left + 1] - t_ns[left])
+        self._Ts = interpolate_poses(Ts_world_camera, left, weight)
+        T = invert(self._Ts[1:]) @ self._Ts[:-1]
+        # Where the middle of the picture before is now, for a far scene, and per 1/m of a near one.
+        steps = np.concatenate([T[:, :2, 2] / T[:, 2:3, 2], T[:, :2, 3]], axis=1)
+        self._flow = np.concatenate([np.zeros((1, 4)), np.cumsum(steps, axis=0)])
+
+    def flow(self, t_ns: Int64[np.ndarray, " n"]) -> Float64[np.ndarray, "steps 2 2"]:
+        """Flow between these times: [turn, move] by [right, down]."""
+        flow = [np.interp(t_ns, self.t_ns, column) for column in self._flow.T]
+        return np.diff(np.array(flow).T.reshape(-1, 2, 2), axis=0)
+
+    def turned_rad(self, t_ns: np.ndarray, later_ns: int) -> Float64[np.ndarray, " n"]:
+        """By how much it turns, or moves past what is 1 m away, from each time on; 0 at the end."""
+        last = len(self._Ts) - 1
+        at, later = (np.searchsorted(self.t_ns, t).clip(0, last) for t in (t_ns, t_ns + later_ns))
+        return turned_rad(self._Ts[at], self._Ts[later])
+
+
+def turned_rad(Ts: np.ndarray, later: np.ndarray) -> Float64[np.ndarray, " n"]:
+    """By how much bodies turn from poses to others, or move past what is a metre away."""
+    moved = invert(Ts) @ later
+    far_m = np.linalg.norm(moved[:, :3, 3], axis=1)
+    return np.asarray(rotation_angle(moved[:, :3, :3]) + far_m)
+
+
+def _explained(flow: np.ndarray, predicted: np.ndarray, turn: str = _AS_READ) -> float:
+    """Share of the flow that the camera's turns and moves explain, both the way they go."""
+    # Of a turn and a move past what is half a metre away.
+    if not len(flow) or np.mean((np.array([1.0, 2.0]) @ predicted) ** 2) < MIN_FLOW_RAD**2:
+        return 0.0
+    A = np.einsum("ij,nkj->nik", np.array(TURNS[turn], dtype=np.float64), predicted).reshape(-1, 2)
+    y, shares = flow.ravel(), [0.0]
+    for columns in ([0, 1], [0], [1]):
+        weights = np.linalg.lstsq(A[:, columns], y, rcond=None)[0]
+        if (weights > 0).all() and weights.max() > MIN_WEIGHT:
+            shares.append(1 - float(((y - A[:, columns] @ weights) ** 2).sum() / (y @ y)))
+    return max(shares)
+
+
+@dataclass(frozen=True)
+class ViewFaults:
+    """What a camera's pictures and its motion say of each other; None where they say nothing.
+
+    Attributes:
+        still_share: of the images before which the camera turned, those that are the same.
+        turn: how the images are turned or mirrored.
+        like: another camera whose motion the pictures show, and not that of their own.
+        lag_s: by how much images show what was before their time, with its standard deviation.
+    """
+
+    still_share: float | None = None
+    turn: str | None = None
+    like: str | None = None
+    lag_s: tuple[float, float] | None = None
+
+
+def view_faults(name: str, view: View, motions: Mapping[str, CameraMotion]) -> ViewFaults:
+    """Compare the pictures of the camera `name` with its motion, and with those of others."""
+    motion, margin_ns = motions[name], round(MAX_LAG_S * 1e9)
+    inside = view.t_ns >= motion.t_ns[0] + margin_ns
+    inside &= view.t_ns <= motion.t_ns[-1] - margin_ns
+    view = View(view.t_ns[inside], view.pictures[inside], view.K, view.size_px)
+    if len(view.t_ns) < MIN_VIEW_IMAGES:
+        return ViewFaults()
+    still_share = _still_share(view, motion)
+    # Across a pause there is no flow.
+    known = np.diff(view.t_ns) < 2 * np.median(np.diff(view.t_ns))
+    flow, predicted = view.flow()[known], motion.flow(view.t_ns)[known]
+    lags = _Lags(view.t_ns, flow, motion, known)
+    shares = {turn: _explained(flow, predicted, turn) for turn in TURNS}
+    others = {n: _explained(flow, one.flow(view.t_ns)[known]) for n, one in motions.items()}
+    turn, like = max(shares, key=shares.__getitem__), max(others, key=others.__getitem__)
+    # What is late may look turned in a motion to and fro.
+    least = max(RIGHT_SHARE, shares[_AS_READ] + MIN_APART, lags.share + WRONG_SHARE)
+    if others[like] > max(least, shares[turn]):
+        return ViewFaults(still_share, like=like)
+    halves = np.array_split(np.arange(len(flow)), 2)
+    if shares[turn] > least and all(
+        _explained(flow[p], predicted[p], turn) > _explained(flow[p], predicted[p]) for p in halves
+    ):
+        near = (one for one in TURNS if shares[one] > shares[turn] - MIN_APART)
+        return ViewFaults(still_share, " or ".join(near))
+    return ViewFaults(still_share, lag_s=lags.sure(shares[_AS_READ]))
+
+
+def _still_share(view: View, motion: CameraMotion) -> float | None:
+    step_ns = float(np.median(np.diff(view.t_ns)))
+    later = max(1, round(1e9 / step_ns))
+    turned = motion.turned_rad(view.t_ns[:-later], round(later * step_ns)) > TURNED_RAD
+    if np.count_nonzero(turned) < MIN_TURNED:
+        return None
+    changed = apart(view.pictures[later:], view.pictures[:-later])[turned]
+    return float((changed < STILL_NOISE * noise_levels(view.pictures)).mean())
+
+
+class _Lags:
+    """The lag at which a camera's motion explains most of a flow, and how much that is."""
+
+    def __init__(
+        self, t_ns: np.ndarray, flow: np.ndarray, motion: CameraMotion, known: np.ndarray
+    ) -> None:
+        self._flow = flow
+        self._lags_s = np.arange(-MAX_LAG_S, MAX_LAG_S + LAG_STEP_S / 2, LAG_STEP_S)
+        self._predicted = [motion.flow(t_ns - round(lag * 1e9))[known] for lag in self._lags_s]
+        self.lag_s, self.share = self._best(np.arange(len(flow)))
+
+    def _best(self, rows: np.ndarray) -> tuple[float, float]:
+        shares = np.array([_explained(self._flow[rows], one[rows]) for one in self._predicted])
+        top = int(shares[1:-1].argmax()) + 1
+        before, at, after = shares[top - 1 : top + 2].tolist()
+        offset = 0.5 * (before - after) / min(before - 2 * at + after, -1e-12)
+        return float(self._lags_s[top] + np.clip(offset, -0.5, 0.5) * LAG_STEP_S), at
+
+    def sure(self, without: float) -> tuple[float, float] | None:
+        """The lag and its sigma if it explains much of what is left `without` one."""
+        if not MIN_LAG_S < abs(self.lag_s) < MAX_LAG_S - 2 * LAG_STEP_S:
+            return None
+        if self.share < RIGHT_SHARE or self.share - without < MIN_GAIN * (1 - without):
+            return None
+        # The jackknife; a grid is no more exact than a tenth of its step.
+        rows = np.arange(len(self._flow))
+        parts = np.array_split(rows, NUM_PARTS)
+        left_out = [self._best(np.setdiff1d(rows, part))[0] for part in parts]
+        sigma_s = max(float(np.sqrt((NUM_PARTS - 1) * np.var(left_out))), LAG_STEP_S / 10)
+        return (self.lag_s, sigma_s) if abs(self.lag_s) > LAG_SIGMAS * sigma_s else None

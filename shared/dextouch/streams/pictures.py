@@ -1,0 +1,171 @@
+"""Finds images that no working camera takes though their bytes are valid, by small copies of them.
+
+Stations apply it to the last seconds, alignment to recordings. Noise of sensors and encoders
+averages out over a block of a copy, so that equal contents look equal.
+"""
+
+from typing import Final
+
+import numpy as np
+from jaxtyping import Bool, Float32, UInt8
+
+from dextouch.streams.repeats import ImageFault, spread
+
+IMAGE_FAULTS: Final[dict[ImageFault, str]] = {
+    "black": "black images between others",
+    "torn": "images with rows of another, or without content",
+    "older": "images that came before",
+    "mixed": "images out of order, or of two cameras",
+    "pumping": "images whose light pumps",
+}
+PICTURE_SHAPE = ROWS, COLUMNS = 24, 32
+# Pixels in a block along each axis of those that are averaged: 64 of 400 of a VGA image.
+_SAMPLES: Final = 8
+_LEAST_IMAGES: Final = 6
+# Blocks of quiet sensors and encoders scatter by so many levels, and what moves by times as much.
+NOISE_LEVELS: Final = 0.25
+MOVES: Final = 5.0
+# Sensors have a pedestal of some levels at most; rooms are brighter than the second.
+DARK_LEVEL, LIT_LEVEL = 8.0, 30.0
+# What decoders write where data ends: grey, nothing, or the green of zeros in YUV. It is more even
+# than rows of sensors, and both sides of a line have rows enough to be no hand that comes and goes.
+FILLS: Final = (128.0, 0.0, 135.0)
+EVEN_LEVELS: Final = 1.0
+MIN_ROWS: Final = 3
+# Rows of another image are off both neighbours by times what these are off each other, and more:
+# in a motion that goes on they are off by half of it.
+ALIEN, ALIEN_LEVELS = 1.6, 8.0
+# An older image comes again from a buffer of so many.
+MAX_BUFFER: Final = 32
+# Motion that goes on makes two steps of a picture longer than one. Of alternating cameras and
+# exchanged images two steps are shorter, by this factor at least.
+BACK_SHARE: Final = 0.8
+# Light of all blocks alike changes by so much in one image, both ways, in a second of pumping.
+PUMPED: Final = 0.04
+MIN_PUMPED: Final = 2
+
+
+def thumbnail(image: UInt8[np.ndarray, "h w c"]) -> Float32[np.ndarray, "24 32"]:
+    """Mean levels of blocks of an image: of its green, or of its only channel."""
+    rows, columns = (
+        (2 * np.arange(count * _SAMPLES) + 1) * size // (2 * count * _SAMPLES)
+        for count, size in zip(PICTURE_SHAPE, image.shape, strict=False)
+    )
+    chosen = image[rows[:, None], columns, image.shape[2] // 2]
+    blocks = chosen.reshape(ROWS, _SAMPLES, COLUMNS, _SAMPLES).sum(axis=1, dtype=np.uint16)
+    return blocks.sum(axis=-1, dtype=np.uint16) / np.float32(_SAMPLES * _SAMPLES)
+
+
+def apart(some: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Mean levels by which pictures [n, 24, 32] differ, but for the light of a whole image."""
+    difference = some - others
+    difference -= difference.mean(axis=(-2, -1), keepdims=True)
+    return np.asarray(np.abs(difference).mean(axis=(-2, -1)))
+
+
+def image_faults(
+    pictures: Float32[np.ndarray, "n 24 32"],
+) -> dict[ImageFault, Bool[np.ndarray, " n"]]:
+    """Which of consecutive pictures, by `thumbnail`, have a fault of `IMAGE_FAULTS`; one at most.
+
+    Rows that stay those of the image before are no fault: they may show what stands still.
+    """
+    count, found = len(pictures), dict[ImageFault, np.ndarray]()
+    if count < _LEAST_IMAGES:
+        return found
+    means = pictures.mean(axis=(1, 2))
+    found["black"] = (means < DARK_LEVEL) & (np.median(means) > LIT_LEVEL)
+    found["torn"] = _filled(pictures[:, -MIN_ROWS:].reshape(count, -1)) & ~found["black"]
+    ordinary = np.flatnonzero(~found["black"] & ~found["torn"])
+    pictures = pictures[ordinary]
+    if len(pictures) >= _LEAST_IMAGES:
+        steps, two = (apart(pictures[by:], pictures[:-by]) for by in (1, 2))
+        noise = noise_levels(pictures)
+        rest: dict[ImageFault, np.ndarray] = {
+            "mixed": _mixed(steps, two, noise),
+            "torn": _alien(pictures),
+            "older": _older(pictures, steps, noise),
+            "pumping": _pumping(pictures),
+        }
+        taken = np.zeros(count, dtype=bool)
+        for name, marked in rest.items():
+            new = spread(marked, ordinary, count) & ~taken
+            found[name], taken = found.get(name, np.zeros(count, dtype=bool)) | new, taken | new
+    return {name: marked for name, marked in found.items() if marked.any()}
+
+
+def _filled(last: np.ndarray) -> Bool[np.ndarray, " n"]:
+    """Pictures whose `last` rows are what decoders fill in, unlike those of both neighbours."""
+    near_fill = (np.abs(last.mean(axis=1)[:, None] - FILLS) < 3 * EVEN_LEVELS).any(axis=1)
+    unlike = np.zeros(len(last), dtype=bool)
+    # A scene that looks so, such as a plain wall, stays for more than an image or two.
+    for by in (1, 2):
+        differs = np.abs(last[by:] - last[:-by]).mean(axis=1) > ALIEN_LEVELS
+        unlike[by:-by] |= differs[:-by] & differs[by:]
+    return near_fill & unlike & (np.ptp(last, axis=1) < EVEN_LEVELS)
+
+
+def noise_levels(pictures: Float32[np.ndarray, "n 24 32"]) -> float:
+    """Mean difference of two pictures of the same: what the quietest blocks turn back and forth."""
+    turns = np.abs(pictures[2:] - 2 * pictures[1:-1] + pictures[:-2])
+    # Those of two cameras in turn.
+    again = np.abs(pictures[2:] - pictures[:-2])
+    # Second differences of noise are √3 times first ones, whose mean is 1.18 times their median.
+    turn, step = (float(np.percentile(np.median(x, axis=0), 5)) for x in (turns, again))
+    return max(NOISE_LEVELS, 1.18 * min(turn / 3**0.5, step))
+
+
+def is_same_picture(one: np.ndarray, other: np.ndarray) -> bool:
+    """Whether two pictures show the same but for the noise of a dark room, of some 1 level."""
+    return float(apart(one, other)) < MOVES * NOISE_LEVELS
+
+
+def _alien(pictures: np.ndarray) -> Bool[np.ndarray, " n"]:
+    """Pictures whose upper or lower rows are unlike those of the images beside, which are alike."""
+    step = np.abs(np.diff(pictures, axis=0)).mean(axis=2)
+    two = np.abs(pictures[2:] - pictures[:-2]).mean(axis=2)
+    alien = np.minimum(step[:-1], step[1:]) > ALIEN * two + ALIEN_LEVELS
+    count = alien.sum(axis=1)
+    # From the first such row down, or from the last one up; some may look alike.
+    heights = [ROWS - rows.argmax(axis=1) for rows in (alien, alien[:, ::-1])]
+    torn = count >= 0.75 * np.minimum(*heights)
+    return np.pad(torn & (count >= MIN_ROWS) & (count <= ROWS - MIN_ROWS), 1)
+
+
+def _older(pictures: np.ndarray, steps: np.ndarray, noise: float) -> Bool[np.ndarray, " n"]:
+    """Pictures that came before, though others move; not those of a motion that turns back."""
+    older = np.zeros(len(pictures), dtype=bool)
+    for at in (np.flatnonzero(steps[1:] > MOVES * noise) + 2).tolist():
+        first = max(0, at - MAX_BUFFER)
+        distances = apart(pictures[first : at - 1], pictures[at])
+        same = first + int(distances.argmin())
+        if distances.min() < min(2 * noise, 0.2 * steps[at - 1]):
+            turns = same > 0 and at + 1 < len(pictures)
+            turns = turns and apart(pictures[at + 1], pictures[same - 1]) < (
+                BACK_SHARE * steps[same - 1]
+            )
+            older[at] = not turns
+    return older
+
+
+def _mixed(steps: np.ndarray, two: np.ndarray, noise: float) -> Bool[np.ndarray, " n"]:
+    """Pairs whose first is further from the picture before than its second is, and the reverse.
+
+    A motion that turns back once has no such pair.
+    """
+    mixed = np.zeros(len(steps) + 1, dtype=bool)
+    before, after = steps[:-2], steps[2:]
+    mixed[1:-2] = (two[:-1] < BACK_SHARE * before) & (two[1:] < BACK_SHARE * after)
+    mixed[1:-2] &= np.minimum(before, after) > MOVES * noise
+    mixed[2:] |= mixed[1:-1]
+    return mixed
+
+
+def _pumping(pictures: np.ndarray) -> Bool[np.ndarray, " n"]:
+    ratios = np.diff(np.log(np.maximum(pictures, 2.0)), axis=0)
+    low, middle, high = np.percentile(ratios, (25, 50, 75), axis=(1, 2))
+    pumped = (np.abs(middle) > PUMPED) & (high - low < 0.5 * np.abs(middle))
+    near = np.ones(min(31, len(pumped)))
+    for way in (middle > 0, middle < 0):
+        pumped &= np.convolve(pumped & way, near, mode="same") >= MIN_PUMPED
+    return np.append(False, pumped)

@@ -1,0 +1,182 @@
+"""Faults of a whole glove, of a pad or of a row, made on the readings of mock gloves."""
+
+import numpy as np
+import pytest
+
+from dextouch.errors import InvalidInputError
+from dextouch.schemas import matrix_rows
+from dextouch.streams import TaxelFaults, drifting_taxels, implausible_gain
+from dextouch.tactile.layout import DEXTOUCH_V1
+from services.acquisition.health.cells import GloveRecord, TaxelCheck
+from services.acquisition.mocks.gloves import GloveCalibration
+from services.acquisition.mocks.pattern import pattern_streams
+from services.alignment.calibration.tactile_tare import (
+    REASONS,
+    TactileCalibration,
+    taxel_faults,
+    unusable_taxels,
+)
+from tests.unit.acquisition.health_blocks_made import block, judged
+
+SEEDS = range(20)
+(PRESSURES,) = [s.values for s in pattern_streams() if s.descriptor.name == "tactile_left"]
+
+
+def take(seed, *, noise=1.0, seconds=24):
+    """A mock glove with the noise of a real one: each finger presses in turn, and the palm."""
+    made = GloveCalibration.seeded("left", seed)
+    kpa = np.tile(PRESSURES, (-(-seconds // 8), 1))[: 60 * seconds]
+    clean = made.readings(kpa, side="left")
+    noisy = clean + noise * np.random.default_rng(seed).standard_normal(clean.shape)
+    calibration = TactileCalibration.from_record(made.matrices("left"), "left")
+    return calibration, np.clip(np.rint(noisy), 0, 65535)
+
+
+def found(calibration, counts):
+    faults = taxel_faults(calibration, np.array_split(counts, 5))
+    repeats = [one for one in faults.repeats() if not one.harmless]
+    if any(one.whole for one in repeats):
+        with pytest.raises(InvalidInputError, match="it is frozen"):
+            unusable_taxels(calibration, faults)
+        return {"frozen": range(len(counts))}
+    try:
+        states = unusable_taxels(calibration, faults)
+    except InvalidInputError as error:
+        return {error.details["fault"]: np.flatnonzero(faults.faults()[error.details["fault"]])}
+    taxels = {REASONS[code]: np.flatnonzero(states == code) for code in set(states.tolist()) - {0}}
+    return taxels | {one.cause: np.flatnonzero(one.samples) for one in repeats}
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.3, 0.6, 3.0])
+def test_mock_gloves_with_any_noise_have_no_fault(noise):
+    for seed in SEEDS:
+        assert found(*take(seed, noise=noise)) == {}
+        calibration, counts = take(seed, noise=0.0)
+        # Nothing is touched.
+        rest = calibration.tare_counts.mean() + noise * np.random.default_rng(seed).standard_normal(
+            counts.shape
+        )
+        rest = np.rint(rest + np.random.default_rng(9).uniform(-0.5, 0.5, 360))
+        assert "frozen" not in found(calibration, rest)
+
+
+@pytest.mark.parametrize("since", [0, 400, 900], ids=["all", "most", "a part"])
+@pytest.mark.parametrize("dither", [(-1, 0, 1), (-1, 1), (-1, 0, 0, 1)], ids=str)
+def test_a_frozen_glove_with_dither(since, dither):
+    for seed in SEEDS:
+        calibration, counts = take(seed, noise=[0.0, 1.0][seed % 2])
+        rng = np.random.default_rng(seed)
+        counts[since:] = counts[since] + rng.choice(dither, counts[since:].shape)
+        assert abs(len(found(calibration, counts)["frozen"]) - (1440 - since)) <= 60
+
+
+@pytest.mark.parametrize(("kpa", "least"), [(4.0, 6), (10.0, 18), (25.0, 18)])
+@pytest.mark.parametrize("bend", [0.0, 2.0])
+def test_the_zero_of_a_pad_that_drifts(kpa, least, bend):
+    hits = 0
+    for seed in SEEDS:
+        calibration, counts = take(seed)
+        rng = np.random.default_rng(seed)
+        pad = np.arange(16) + 16 * rng.integers(5)
+        way = np.linspace(0, 1, len(counts))
+        way = way if not bend else 1 - np.exp(-bend * way)
+        counts[:, calibration.cells[pad]] += np.rint(40 * kpa * way)[:, None]
+        hits += pad.tolist() == found(calibration, counts).get("drifting", pad[:0]).tolist()
+    assert hits >= least, hits
+
+
+def test_a_pad_that_is_touched_more_and_more_does_not_drift():
+    rows, columns = np.indices((4, 4))
+    bump = np.exp(-((rows - 1.5) ** 2 + (columns - 1.5) ** 2) / 3).ravel()
+    lows = np.zeros((40, 320))
+    lows[:, 16:32] = np.linspace(0, 20, 40)[:, None] * bump
+    usable = np.ones(320, dtype=bool)
+    assert not drifting_taxels(lows, usable).any()
+    lows[:, 16:32] = np.where(np.arange(40) < 20, 0, 20)[:, None]
+    assert not drifting_taxels(lows, usable).any()
+
+
+@pytest.mark.parametrize("top", [255, 900, 1023])
+def test_readings_that_end_at_a_limit(top):
+    for seed in SEEDS:
+        calibration, counts = take(seed, noise=[0.0, 1.0][seed % 2])
+        ends = (counts >= top).mean(axis=0)[calibration.cells]
+        named = found(calibration, np.minimum(counts, top))["saturated"]
+        assert set(np.flatnonzero(ends > 0.05)) <= set(named) <= set(np.flatnonzero(ends > 0.01))
+
+
+@pytest.mark.parametrize(("share", "least"), [(0.1, 7), (0.25, 11), (0.5, 13)])
+def test_a_row_that_holds_a_part_of_another_one(share, least):
+    hits = 0
+    for seed in SEEDS:
+        calibration, counts = take(seed)
+        one, other = np.random.default_rng(seed).permutation(15)[:2]
+        rows = [calibration.cells[80 + 16 * row + np.arange(16)] for row in (one, other)]
+        tare = np.zeros(360)
+        tare[calibration.cells] = calibration.tare_counts
+        counts[:, rows[1]] += np.rint(share * (counts[:, rows[0]] - tare[rows[0]]))
+        hits += other in (found(calibration, counts).get("ghost", np.zeros(0)) - 80) // 16
+    assert hits >= least, hits
+
+
+@pytest.mark.parametrize(
+    ("factor", "said"),
+    [
+        (6.895, "counts/psi"), (1 / 6.895, "psi taken for kPa"), (100, "counts/bar"),
+        (1e3, "counts/MPa"), (1 / 0.03, "counts/N"),
+    ],
+)  # fmt: skip
+def test_gains_in_another_unit_are_named(factor, said):
+    areas_m2 = DEXTOUCH_V1.areas_m2
+    for seed in SEEDS:
+        gain = GloveCalibration.seeded("left", seed).gain_counts_per_kpa
+        assert implausible_gain(gain[:320], areas_m2) is None
+        assert f"these look like {said}" in implausible_gain(gain[:320] * factor, areas_m2)
+    matrices = GloveCalibration.seeded("left", 0).matrices("left")
+    name = "tactile_left_gain_counts_per_kpa"
+    scaled = matrices | {name: matrix_rows(np.array(matrices[name]) * factor)}
+    with pytest.raises(InvalidInputError, match=said) as refused:
+        TactileCalibration.from_record(scaled, "left")
+    assert refused.value.details["fault"] == "unit"
+
+
+def live(change, *, gain=1.0, seconds=64):
+    """What the health of a station says of the same readings."""
+    calibration, counts = take(3, seconds=seconds)
+    made = GloveCalibration.seeded("left", 3)
+    cells = DEXTOUCH_V1.raw_indices("left")
+    gains = made.gain_counts_per_kpa * gain
+    check = TaxelCheck(GloveRecord(made.tare_counts, gains, np.zeros(360), cells))
+    counts, said = change(calibration, counts), {}
+    for second in range(seconds):
+        part = slice(60 * second, 60 * second + 60)
+        t_s = np.arange(part.start, part.stop) / 60
+        evaluation = judged(check, block(t_s, counts[part].astype(np.uint16)), round(1e9 * t_s[-1]))
+        said |= {f.message: f.code for f in evaluation.findings if f.code != "baseline"}
+    return said
+
+
+def test_the_health_of_a_station_names_the_same():
+    def dithered(_, counts):
+        counts[1200:] = counts[1200] + np.random.default_rng(0).integers(-1, 2, counts[1200:].shape)
+        return counts
+
+    def drifting(calibration, counts):
+        counts[:, calibration.cells[16:32]] += np.linspace(0, 400, len(counts))[:, None]
+        return counts
+
+    def same(_, counts):
+        return counts
+
+    assert live(same) == {}
+    assert "frozen" in live(dithered).values()
+    assert any("16 taxels are drifting in index" in text for text in live(drifting))
+    clipped = live(lambda _, counts: np.minimum(counts, 255), seconds=10)
+    assert any("are saturated in" in text for text in clipped)
+    assert any("counts/psi" in text for text in live(same, gain=6.895, seconds=10))
+
+
+def test_taxels_that_say_nothing_are_no_fault():
+    faults = TaxelFaults(np.full(320, 120.0), np.full(320, 40.0))
+    faults.add(np.full((40, 320), np.nan))
+    assert not any(faults.faults()[name].any() for name in ("saturated", "drifting", "ghost"))
