@@ -271,9 +271,9 @@ class CatalogIndex:
             gone = [(name,) for name in seen - changes.keys()]
             connection.executemany("DELETE FROM announced WHERE name = ?", gone)
             is_empty = not any(numbers.values())
-        for kind in KINDS:
+        for kind in () if is_check else KINDS:
             some = {item_id: 0 for what, item_id in new.values() if what == kind}
-            self._compare_some(connection, kind, {} if is_check else some)
+            self._compare_some(connection, kind, some)
         # Items that could not be read are left to the next look of any process.
         done = [(n,) for n, (kind, item_id) in new.items() if item_id not in self._omitted[kind]]
         if done:

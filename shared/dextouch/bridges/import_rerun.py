@@ -479,10 +479,8 @@ def _numbers(row: Row, known: Known, frame: str | None) -> Iterator[Item]:
         is_scalars = _archetype(name) == "Scalars"
         said = "" if is_scalars else f"component {name}"
         dtype = numbers.dtype.name
-        form = Form(
-            "scalar", NUMBERS_UNIT, dtype, numbers.shape, frame, as_numbers=said, notes=notes
-        )  # fmt: skip
-        yield _item(form, numbers.copy, "Scalars" if is_scalars else name)
+        form = Form("scalar", NUMBERS_UNIT, dtype, numbers.shape, frame, as_numbers=said)
+        yield _item(replace(form, notes=notes), numbers.copy, "Scalars" if is_scalars else name)
 
 
 def _pinhole(known: Known) -> CameraModel | None:
