@@ -29,9 +29,9 @@ from dextouch.streams import (
 from services.alignment.retargeting.wrist import calibrated_transform
 from services.alignment.synchronization.recorded_streams import DatedStream, moved_poses
 
-# Images of a camera that are looked at, half a minute in the middle of the take: H.264 of VGA takes
-# some 2 ms each, and stations look at all.
-MAX_LOOKED: Final = 900
+# Images of a camera that are looked at, some seconds in the middle of the take: JPEG of VGA takes
+# 0.9 ms each, H.264 0.6 ms, the rest of an alignment of 30 s some 3 s; and stations look at all.
+MAX_LOOKED: Final = 120
 # Poses around them with which lags are looked for.
 REACH_NS: Final = 500_000_000
 MIN_POSES: Final = 2

@@ -50,6 +50,9 @@ MIN_VIEW_IMAGES: Final = 60
 # and its size, as cameras without a calibrated latency are as late as an image takes.
 MAX_LAG_S, LAG_STEP_S = 0.4, 0.01
 MIN_GAIN, LAG_SIGMAS, MIN_LAG_S = 0.25, 4.0, 0.035
+# What moves by itself, such as hands that the head follows, shifts a lag by some of this times the
+# share that it leaves unexplained.
+OWN_MOTION_S: Final = 0.3
 NUM_PARTS: Final = 6
 # While a camera turns by so much in a second, or moves past what is a metre away, its picture is
 # off by 30 px of VGA at 500 px, and changes by more than noise does; in so many images at least.
@@ -245,5 +248,6 @@ class _Lags:
         rows = np.arange(len(self._flow))
         parts = np.array_split(rows, NUM_PARTS)
         left_out = [self._best(np.setdiff1d(rows, part))[0] for part in parts]
-        sigma_s = max(float(np.sqrt((NUM_PARTS - 1) * np.var(left_out))), LAG_STEP_S / 10)
+        scatter_s = float(np.sqrt((NUM_PARTS - 1) * np.var(left_out)))
+        sigma_s = max(LAG_STEP_S / 10, float(np.hypot(scatter_s, OWN_MOTION_S * (1 - self.share))))
         return (self.lag_s, sigma_s) if abs(self.lag_s) > LAG_SIGMAS * sigma_s else None
