@@ -65,6 +65,8 @@ MIN_REST_SAMPLES = 40
 PLAUSIBLE_NS = 5_000_000_000
 # A content that stays for longer while its camera moves is none of now.
 MIN_STILL_S = 1.5
+# What a camera shows is told of pictures as new as this; those of H.264 are up to 8 images late.
+FRESH_NS, ENCODER_NS = 1_000_000_000, 300_000_000
 # Poses of bodies that are compared of that time.
 MAX_COMPARED = 100
 # Half seconds in which motion and touch of hands are compared.
@@ -314,9 +316,12 @@ class BodiesCheck:
         """The check of one stream."""
         return partial(self._judge, name)
 
-    def turned_rad(self, name: str, since_ns: int) -> float:
-        """By how much a tracker turned since then (5 s at most), or moved past what is 1 m away."""
-        poses = [values[t_ns >= since_ns] for t_ns, values in self._poses.get(name, ())]
+    def turned_rad(self, name: str, since_ns: int, until_ns: int) -> float:
+        """By how much a tracker turned (in the last 5 s), or moved past what is 1 m away."""
+        poses = [
+            values[(t_ns >= since_ns) & (t_ns <= until_ns)]
+            for t_ns, values in self._poses.get(name, ())
+        ]
         if not sum(map(len, poses)):
             return 0.0
         Ts = transform_from_pose(np.concatenate(poses).astype(np.float64))
@@ -412,16 +417,20 @@ class CameraCheck:
     def __init__(self, driver: Driver, name: str, bodies: BodiesCheck | None = None) -> None:
         self._driver, self._tracker, self._bodies = driver, TRACKERS.get(name, ""), bodies
         self._since_ns: dict[str, int] = {}
+        self._newest_ns = 0
 
     def __call__(self, evaluation: Evaluation) -> None:
         """One evaluation."""
         quality, now_ns = self._driver.quality, evaluation.now_ns
         if quality is None:
             return
-        fault, clipped = quality.fault, quality.clipped_ratio
+        self._newest_ns = int(evaluation.block.t_host_ns.max(initial=self._newest_ns))
+        is_fresh = now_ns - self._newest_ns <= FRESH_NS
+        fault, clipped = quality.fault if is_fresh else None, quality.clipped_ratio
         frozen, text = quality.frozen, "the same image repeatedly"
-        if not frozen and quality.still_s > MIN_STILL_S and self._bodies is not None:
-            turned = self._bodies.turned_rad(self._tracker, now_ns - round(quality.still_s * 1e9))
+        if not frozen and is_fresh and quality.still_s > MIN_STILL_S and self._bodies is not None:
+            since_ns = self._newest_ns - round(quality.still_s * 1e9)
+            turned = self._bodies.turned_rad(self._tracker, since_ns, self._newest_ns - ENCODER_NS)
             frozen, text = turned > 2 * TURNED_RAD, "shows the same while the camera moves"
         flags = {
             "image_frozen": (frozen, text),
