@@ -41,8 +41,12 @@ _LEFT_OUT: Final = ("black", "torn")
 def looked_at(stream: DatedStream) -> tuple[DatedStream, View | None]:
     """A camera's stream with what is wrong with single images, and what was looked at.
 
-    The view has no matrix yet. Damaged images are said elsewhere, and nothing is looked at then.
+    The view has no matrix yet. Damaged images are said elsewhere, and nothing is looked at then, or
+    where images are too small for blocks of several pixels.
     """
+    height, width = stream.descriptor.shape[:2]
+    if height < 2 * PICTURE_SHAPE[0] or width < 2 * PICTURE_SHAPE[1]:
+        return stream, None
     count, name = len(stream.t_ns), stream.name
     first = max(0, count - MAX_LOOKED) // 2
     places = np.arange(first, min(count, first + MAX_LOOKED))
@@ -62,7 +66,6 @@ def looked_at(stream: DatedStream) -> tuple[DatedStream, View | None]:
         samples, harmless = spread(marked, places, count), fault not in _LEFT_OUT
         implausible.append(Implausible(fault, IMAGE_FAULTS[fault], samples, harmless=harmless))
         first_s[f"{name}_first_{fault}_s"] = float(stream.t_ns[samples][0] - start_ns) / 1e9
-    height, width = stream.descriptor.shape[:2]
     view = View(stream.t_ns[places], pictures, np.eye(3), (height, width))
     quality = stream.quality | first_s
     return replace(stream, implausible=tuple(implausible), quality=quality), view
