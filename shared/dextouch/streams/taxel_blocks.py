@@ -24,15 +24,15 @@ RESTING_TAXELS: Final = 0.3
 # The zero of a pad drifts if its lows rise (or fall) by as much as a contact, of which an eighth at
 # either end is not seen, little by little and alike. A contact is there within half a second, and
 # presses the middle of a pad more. A grip that is slowly pressed harder is never let go: what
-# touches a drifting pad comes and goes twice at least, and presses by most of the drift or more.
-# Pads of few taxels are always alike.
+# touches a drifting pad comes and goes twice at least, and presses some taxels more than others by
+# half of the drift. Pads of few taxels are always alike.
 ZERO_PARTS: Final = 8
 MIN_DRIFT_KPA: Final = 0.75 * CONTACT_THRESHOLD_KPA
 MAX_PART_OF_DRIFT: Final = 0.5
 MAX_UNLIKE: Final = 0.35
 MIN_PAD_TAXELS: Final = 9
 MIN_RELEASES: Final = 2
-MIN_TOUCH_SHARE: Final = 0.75
+MIN_TOUCH_SHARE: Final = 0.5
 # Taxels that share a limit end at the highest reading of all, five of them, or three where
 # converters end (2^n - 1): it is read in so many samples, and more often than all within 2 % below.
 # Of other readings with less than three steps there nothing is known: a steady grip is as flat.
@@ -195,7 +195,7 @@ def drifting_taxels(
             steps = np.abs(np.diff(np.percentile(zeros[parts], 25, axis=1)))
             each = np.abs(zeros[parts[-1]] - zeros[parts[0]])
             unlike = float(np.subtract(*np.percentile(each, [90, 10])))
-            above_kpa = np.percentile(lows_kpa[:, taxels] - zeros, 90, axis=1)
+            above_kpa = np.subtract(*np.percentile(lows_kpa[:, taxels] - zeros, [90, 10], axis=1))
             touched = above_kpa > max(MIN_TOUCH_SHARE * steps.sum(), CONTACT_THRESHOLD_KPA)
             if (
                 steps.sum() >= MIN_DRIFT_KPA

@@ -137,6 +137,9 @@ def test_a_pad_that_is_touched_more_and_more_does_not_drift():
             squeeze = np.zeros((80, 320))
             squeeze[:, taxels] = (way * (1 + 0.2 * np.sin(np.arange(80))))[:, None]
             assert not drifting_taxels(squeeze, usable).any()
+            # It is kneaded, and never let go.
+            squeeze[:, taxels] += 50 * (np.arange(80) % 8 == 4)[:, None]
+            assert not drifting_taxels(squeeze, usable).any()
     # Pads of one taxel are always alike, let go or not.
     pads = [pad.model_dump() | {"rows": 1, "columns": 1} for pad in DEXTOUCH_V1.pads]
     cells = {side: tuple(range(6)) for side in ("left", "right")}
