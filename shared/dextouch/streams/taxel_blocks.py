@@ -20,7 +20,7 @@ DITHERED_TAXELS: Final = 0.5
 MIN_EXPECTED: Final = 60.0
 MAX_OWN_SHARE: Final = 0.1
 MOVING_TAXELS: Final = 0.99
-RESTING_TAXELS: Final = 0.3
+RESTING_TAXELS: Final = 0.05
 # The zero of a pad drifts if its lows rise (or fall) by as much as a contact, of which an eighth at
 # either end is not seen, little by little and alike. A contact is there within half a second, and
 # presses the middle of a pad more. A grip that is slowly pressed harder is never let go: what
