@@ -27,6 +27,8 @@ RESTING_TAXELS: Final = 0.05
 # touches a drifting pad comes and goes twice at least, and presses some taxels more than others by
 # half of the drift. Pads of few taxels are always alike.
 ZERO_PARTS: Final = 8
+# 20 s: a glove that warms up takes minutes, and a grip seconds.
+MIN_ZERO_BLOCKS: Final = 40
 MIN_DRIFT_KPA: Final = 0.75 * CONTACT_THRESHOLD_KPA
 MAX_PART_OF_DRIFT: Final = 0.5
 MAX_UNLIKE: Final = 0.35
@@ -181,7 +183,7 @@ def drifting_taxels(
     A pad is judged that is touched and let go meanwhile: else a slow grip may be all that moves it.
     """
     found = np.zeros(lows_kpa.shape[1], dtype=bool)
-    if len(lows_kpa) < ZERO_PARTS:
+    if len(lows_kpa) < MIN_ZERO_BLOCKS:
         return found
     ends = np.linspace(0, len(lows_kpa) - 1, ZERO_PARTS + 1).round().astype(int)
     # What touches a pad hides its zero for a while.
