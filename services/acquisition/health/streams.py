@@ -25,7 +25,7 @@ from dextouch.streams import (
     turned_rad,
 )
 from services.acquisition.drivers.base import Driver
-from services.acquisition.health.cells import NO_CELL, GloveRecord, glove_record, is_ours
+from services.acquisition.health.cells import glove_record, refused_taxels
 from services.acquisition.health.evaluation import (
     WINDOW_NS,
     Block,
@@ -356,14 +356,21 @@ class HandsCheck:
     def __init__(self, calibration: Mapping[str, Matrix]) -> None:
         self._calibration = calibration
         self._traces = HandTraces(HAND_BINS)
+        self._found, self._found_ns = self._traces.found(), -1
 
     def of(self, descriptor: StreamDescriptor) -> Callable[[Evaluation], None]:
         """The check of one stream."""
-        record = glove_record(descriptor, self._calibration) if is_ours(descriptor) else None
-        return partial(self._judge, descriptor, record)
+        record = glove_record(descriptor, self._calibration)
+        if record is None:
+            return partial(self._judge, descriptor, None)
+        refused = refused_taxels(descriptor, self._calibration, record)
+        return partial(self._judge, descriptor, partial(record.to_kpa, refused=refused))
 
     def _judge(
-        self, descriptor: StreamDescriptor, record: GloveRecord | None, evaluation: Evaluation
+        self,
+        descriptor: StreamDescriptor,
+        to_kpa: Callable[[np.ndarray], np.ndarray] | None,
+        evaluation: Evaluation,
     ) -> None:
         block, layout = evaluation.block, None
         if block.values is None or not len(block):
@@ -371,13 +378,14 @@ class HandsCheck:
         values = block.values
         if descriptor.kind == "tactile":
             layout = descriptor.tactile_layout
-            if record is not None:
-                kpa = (values - record.tare_counts) / record.gain_counts_per_kpa
-                values = np.where(record.cells == NO_CELL, 0.0, kpa[:, record.cells])
+            if to_kpa is not None:
+                values = to_kpa(values.reshape(len(values), -1))
             elif descriptor.unit != TAXEL_UNIT:
                 return
         self._traces.add(descriptor.name, block.t_host_ns, values, layout)
-        cause, message = self._traces.found().get(descriptor.name, ("", ""))
+        if evaluation.now_ns != self._found_ns:
+            self._found, self._found_ns = self._traces.found(), evaluation.now_ns
+        cause, message = self._found.get(descriptor.name, ("", ""))
         if cause:
             code = "frozen" if cause == "frozen" else "implausible"
             evaluation.findings.append(Finding(code, "ERROR", message))
