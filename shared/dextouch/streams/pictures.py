@@ -80,8 +80,10 @@ def image_faults(
     ordinary = np.flatnonzero(~dark & ~found["torn"])
     pictures = pictures[ordinary]
     if len(pictures) >= _LEAST_IMAGES:
-        found["torn"] |= spread(_alien(pictures), ordinary, count)
-        found["pumping"] = spread(_pumping(pictures), ordinary, count) & ~found["torn"]
+        pumping = _pumping(pictures)
+        # Light that pumps makes rows unlike others, too.
+        found["torn"] |= spread(_alien(pictures) & ~pumping.any(), ordinary, count)
+        found["pumping"] = spread(pumping, ordinary, count)
     return {name: marked for name, marked in found.items() if marked.any()}
 
 
@@ -119,7 +121,9 @@ def _alien(pictures: np.ndarray) -> Bool[np.ndarray, " n"]:
     # From the first such row down, or from the last one up; some may look alike.
     heights = [ROWS - rows.argmax(axis=1) for rows in (alien, alien[:, ::-1])]
     torn = count >= 0.75 * np.minimum(*heights)
-    return np.pad(torn & (count >= MIN_ROWS) & (count <= ROWS - MIN_ROWS), 1)
+    # Rolling shutters in light that flickers show bands in image after image.
+    alone = np.convolve(count >= MIN_ROWS, np.ones(min(9, len(count))), mode="same") < 2
+    return np.pad(torn & alone & (count >= MIN_ROWS) & (count <= ROWS - MIN_ROWS), 1)
 
 
 def _pumping(pictures: np.ndarray) -> Bool[np.ndarray, " n"]:
