@@ -22,8 +22,7 @@ PICTURE_SHAPE = ROWS, COLUMNS = 24, 32
 _SAMPLES: Final = 8
 _LEAST_IMAGES: Final = 6
 # Blocks of quiet sensors and encoders scatter by so many levels, and what moves by times as much.
-NOISE_LEVELS: Final = 0.25
-MOVES: Final = 5.0
+NOISE_LEVELS, MOVES = 0.25, 5.0
 # Sensors have a pedestal of some levels at most; rooms are brighter than the second.
 DARK_LEVEL, LIT_LEVEL = 8.0, 30.0
 # What decoders write where data ends: grey, nothing, or the green of zeros in YUV. It is more even
@@ -113,7 +112,7 @@ def is_same_picture(one: np.ndarray, other: np.ndarray) -> bool:
 
 def _alien(pictures: np.ndarray) -> Bool[np.ndarray, " n"]:
     """Pictures whose upper or lower rows are unlike those of the images beside, which are alike."""
-    # Most of a row: no hand that shows for an image.
+    # Half of a row: no hand that shows for an image.
     step = np.median(np.abs(np.diff(pictures, axis=0)), axis=2)
     two = np.median(np.abs(pictures[2:] - pictures[:-2]), axis=2)
     alien = np.minimum(step[:-1], step[1:]) > ALIEN * two + ALIEN_LEVELS
