@@ -95,10 +95,7 @@ def check_views(
 
 
 def _motion(
-    name: str,
-    view: View,
-    streams: Mapping[str, DatedStream],
-    calibration: Mapping[str, Matrix],
+    name: str, view: View, streams: Mapping[str, DatedStream], calibration: Mapping[str, Matrix]
 ) -> CameraMotion | None:
     """Motion of a camera; None without poses, or where its mount is not known."""
     tracker = TRACKERS.get(name, "")

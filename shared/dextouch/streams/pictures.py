@@ -22,8 +22,7 @@ PICTURE_SHAPE = ROWS, COLUMNS = 24, 32
 _SAMPLES: Final = 8
 _LEAST_IMAGES: Final = 6
 # Blocks of quiet sensors and encoders scatter by so many levels, and what moves by times as much.
-NOISE_LEVELS: Final = 0.25
-MOVES: Final = 5.0
+NOISE_LEVELS, MOVES = 0.25, 5.0
 # Sensors have a pedestal of some levels at most; rooms are brighter than the second.
 DARK_LEVEL, LIT_LEVEL = 8.0, 30.0
 # What decoders write where data ends: grey, nothing, or the green of zeros in YUV. It is more even
@@ -80,8 +79,10 @@ def image_faults(
     ordinary = np.flatnonzero(~dark & ~found["torn"])
     pictures = pictures[ordinary]
     if len(pictures) >= _LEAST_IMAGES:
-        found["torn"] |= spread(_alien(pictures), ordinary, count)
-        found["pumping"] = spread(_pumping(pictures), ordinary, count) & ~found["torn"]
+        pumping = _pumping(pictures)
+        # Light that pumps makes rows unlike others, too.
+        found["torn"] |= spread(_alien(pictures) & ~pumping.any(), ordinary, count)
+        found["pumping"] = spread(pumping, ordinary, count)
     return {name: marked for name, marked in found.items() if marked.any()}
 
 
@@ -111,7 +112,7 @@ def is_same_picture(one: np.ndarray, other: np.ndarray) -> bool:
 
 def _alien(pictures: np.ndarray) -> Bool[np.ndarray, " n"]:
     """Pictures whose upper or lower rows are unlike those of the images beside, which are alike."""
-    # Most of a row: no hand that shows for an image.
+    # Half of a row: no hand that shows for an image.
     step = np.median(np.abs(np.diff(pictures, axis=0)), axis=2)
     two = np.median(np.abs(pictures[2:] - pictures[:-2]), axis=2)
     alien = np.minimum(step[:-1], step[1:]) > ALIEN * two + ALIEN_LEVELS
@@ -119,7 +120,9 @@ def _alien(pictures: np.ndarray) -> Bool[np.ndarray, " n"]:
     # From the first such row down, or from the last one up; some may look alike.
     heights = [ROWS - rows.argmax(axis=1) for rows in (alien, alien[:, ::-1])]
     torn = count >= 0.75 * np.minimum(*heights)
-    return np.pad(torn & (count >= MIN_ROWS) & (count <= ROWS - MIN_ROWS), 1)
+    # Rolling shutters in light that flickers show bands in image after image.
+    alone = np.convolve(count >= MIN_ROWS, np.ones(min(9, len(count))), mode="same") < 2
+    return np.pad(torn & alone & (count >= MIN_ROWS) & (count <= ROWS - MIN_ROWS), 1)
 
 
 def _pumping(pictures: np.ndarray) -> Bool[np.ndarray, " n"]:

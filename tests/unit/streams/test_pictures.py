@@ -98,6 +98,17 @@ def test_a_hand_that_shows_in_one_image_tears_none():
     assert image_faults(pictures) == {}
 
 
+@pytest.mark.parametrize("rate_hz", [24, 25, 28.6, 29.97, 39.8, 40, 50, 60])
+@pytest.mark.parametrize("is_rolling", [False, True])
+def test_light_that_flickers_tears_no_image(rate_hz, is_rolling):
+    row_s = np.arange(24)[:, None] / 24 * 0.025 * is_rolling
+    for light_hz, strength in ((100, 0.08), (100, 0.25), (120, 0.08), (120, 0.25)):
+        time_s = np.arange(300)[:, None, None] / rate_hz + row_s
+        light = 1 + strength * np.sin(2 * np.pi * light_hz * time_s)
+        pictures = repeated("stir", light_hz) * light
+        assert set(image_faults(pictures.astype(np.float32))) <= {"pumping"}
+
+
 def test_light_that_is_off_for_a_third_of_a_take_is_no_fault():
     pictures = repeated("tap", 0)
     pictures[100:200] = 3
