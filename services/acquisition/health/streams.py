@@ -420,7 +420,7 @@ class FiniteCheck:
 
 
 class CameraCheck:
-    """Judges one camera: anything is a warning, and an error after a second."""
+    """Judges one camera: anything is a warning, and by its rule an error after a second."""
 
     def __init__(self, driver: Driver, name: str, bodies: BodiesCheck | None = None) -> None:
         self._driver, self._tracker, self._bodies = driver, TRACKERS.get(name, ""), bodies

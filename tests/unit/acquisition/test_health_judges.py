@@ -295,7 +295,8 @@ def test_bad_images_warn_and_are_an_error_after_a_second(change, code):
     assert judged(judge, block([]), 0).findings == []
     driver.quality = ImageQuality(**change)
     seen = [codes(judged(judge, block([t]), t * SECOND_NS)) for t in (1, 2)]
-    assert seen == [{code: "WARN"}, {code: "ERROR"}]
+    # Light that pumps is of no camera's making.
+    assert seen == [{code: "WARN"}, {code: "WARN" if code == "image_content" else "ERROR"}]
     driver.quality = ImageQuality()
     assert judged(judge, block([]), 3 * SECOND_NS).findings == []
 
