@@ -5,7 +5,7 @@ import http.client
 import json
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -189,8 +189,12 @@ def opened(urls: Mapping[str, str], way: Way) -> Iterator[Chunk]:
 
 def processor_s(pid: int) -> float:
     """Processor time that the threads of a process have taken so far, to a nanosecond."""
-    tasks = Path(f"/proc/{pid}/task").glob("*/schedstat")
-    return sum(1e-9 * int(task.read_text().split()[0]) for task in tasks)
+    spent_s = 0.0
+    for task in Path(f"/proc/{pid}/task").glob("*/schedstat"):
+        # A thread may end meanwhile.
+        with suppress(FileNotFoundError, ProcessLookupError):
+            spent_s += 1e-9 * int(task.read_text().split()[0])
+    return spent_s
 
 
 @contextmanager

@@ -206,6 +206,7 @@ def _chunks(
     network: NetworkConfig, device: str, episode: EpisodeArrays, rounds: int
 ) -> dict[str, _Measured]:
     model, planned = _model(network, device), plan_of(network)
+    weights = sum(one.memory_bytes for one in planned.parts)
     # The text encoder is not loaded.
     encoder = sum(one.memory_bytes for one in planned.parts if one.name.startswith("text encoder"))
     found = {}
@@ -217,7 +218,8 @@ def _chunks(
             model.predict, inputs, noise, sampling=chunk.sampling, all_images=chunk.all_images
         )
         measured = _timed(compute, device, rounds)
-        found[name] = measured._replace(planned_gb=(planned.peak_bytes - encoder) / 1e9)
+        planned_bytes = weights - encoder + chunk.batch * (planned.peak_bytes - weights)
+        found[name] = measured._replace(planned_gb=planned_bytes / 1e9)
     return found
 
 

@@ -189,11 +189,13 @@ class LiveView:
 
     def ages_s(self, kinds: Container[StreamKind], now_ns: int) -> dict[str, float | None]:
         """Age of the newest sample of each stream of these kinds; None where none ever came."""
-        return {
-            name: (now_ns - self._newest[name].t_host_ns) / 1e9 if name in self._newest else None
-            for name, descriptor in self._descriptors.items()
-            if descriptor.kind in kinds
-        }
+        found: dict[str, float | None] = {}
+        for name, descriptor in self._descriptors.items():
+            if descriptor.kind in kinds:
+                newest = self._newest.get(name)
+                # One may have come since.
+                found[name] = None if newest is None else max(0, now_ns - newest.t_host_ns) / 1e9
+        return found
 
     def poses(self, now_ns: int, *, mounted: bool = True) -> dict[str, Float32[np.ndarray, "n m"]]:
         """Newest poses and keypoints by stream, of those heard within the last 0.5 s.

@@ -40,6 +40,8 @@ ENROLMENTS_FILE = "enrolments.json"
 # Chosen: an operator waits no longer after an outage, and a bucket that is away gets few requests.
 RETRY_PERIOD_S: Final = 30.0
 SWEEP_PERIOD_S: Final = 24 * 3600.0
+# Chosen: of a sweep that failed, which lists the whole bucket.
+SWEEP_RETRY_S: Final = 3600.0
 TRASH_PERIOD_S: Final = 3600.0
 # How soon a deletion reaches an upload that nobody continues.
 WATCH_PERIOD_S: Final = 1.0
@@ -107,6 +109,7 @@ class PendingUploads(PeriodicThread):
         for kind, item_id in self._store.complete_uploads():
             logger.warning("upload_completed", kind=kind, id=item_id)
         if time.monotonic() >= self._sweep_at_s:
+            self._sweep_at_s = time.monotonic() + SWEEP_RETRY_S
             removed = self._store.sweep()
             self._sweep_at_s = time.monotonic() + SWEEP_PERIOD_S
             if removed:

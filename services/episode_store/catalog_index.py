@@ -259,6 +259,8 @@ class CatalogIndex:
             return
         # Before anything is listed: what is announced meanwhile is left to the next look.
         changes, is_empty = self._store.changes(), False
+        seen = {name for (name,) in connection.execute("SELECT name FROM announced")}
+        new = {name: changes[name] for name in changes.keys() - seen}
         last_s = dict(connection.execute("SELECT name, value FROM fact"))
         is_check = not all(self._is_checked.values()) and not _is_recent(last_s.get("checked"))
         if is_check or not changes or not _is_recent(last_s.get("listed")):
@@ -266,18 +268,14 @@ class CatalogIndex:
             for kind, found in numbers.items():
                 self._compare(connection, kind, found, is_check=is_check)
             _note(connection, ("listed", "checked") if is_check else ("listed",))
-            connection.execute("DELETE FROM announced")
+            gone = [(name,) for name in seen - changes.keys()]
+            connection.executemany("DELETE FROM announced WHERE name = ?", gone)
             is_empty = not any(numbers.values())
-        else:
-            seen = {name for (name,) in connection.execute("SELECT name FROM announced")}
-            changes = {name: changes[name] for name in changes.keys() - seen}
-            for kind in KINDS:
-                if some := {item_id: 0 for what, item_id in changes.values() if what == kind}:
-                    self._compare_some(connection, kind, some)
+        for kind in () if is_check else KINDS:
+            some = {item_id: 0 for what, item_id in new.values() if what == kind}
+            self._compare_some(connection, kind, some)
         # Items that could not be read are left to the next look of any process.
-        done = [
-            (n,) for n, (kind, item_id) in changes.items() if item_id not in self._omitted[kind]
-        ]
+        done = [(n,) for n, (kind, item_id) in new.items() if item_id not in self._omitted[kind]]
         if done:
             with transaction(connection):
                 connection.executemany("INSERT OR IGNORE INTO announced VALUES (?)", done)

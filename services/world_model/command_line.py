@@ -67,6 +67,8 @@ def run_distill(arguments: list[str]) -> int:
 def run_cache(arguments: list[str]) -> int:
     """Encode the images of a training, and print how many windows there are."""
     settings = load_settings(CacheCommand, arguments)
+    if settings.plan:
+        return run_train(arguments)
     filled = fill_latent_cache(settings, lambda some: progress(some, "latents", len(some)))
     print(
         f"{filled.path}: {filled.num_windows} windows of {filled.num_episodes} episodes, "

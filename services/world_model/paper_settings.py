@@ -328,7 +328,7 @@ class TrainCommand(CommandSettings, TrainSettings):
 
 
 class CacheCommand(TrainCommand):
-    """Encode the images of a training once, before it, so that it never runs the video encoder.
+    r"""Encode the images of a training once, before it, so that it never runs the video encoder.
 
     Give it the flags of that training, which then reads the same file. What is there already is
     not computed again, so that it can be interrupted, and new episodes can be added. A training

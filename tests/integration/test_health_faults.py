@@ -26,9 +26,9 @@ QUICK = (
     "disk full in 20 min",
 )
 # Told to whoever asks while a sample is overdue; what needs minutes of asking the device; and what
-# happens to the computer (test_health_chaos.py).
+# happens to the computer (test_health_chaos.py). What images show is in test_health_judges.py.
 TESTED_ELSEWHERE = {"late", "latency_calibration", "upload_refused", "not_followed"}
-TESTED_ELSEWHERE |= {"overload", "host_suspended", "wall_clock_set"}
+TESTED_ELSEWHERE |= {"overload", "host_suspended", "wall_clock_set", "image_content"}
 
 
 def judged(name, outcome):

@@ -54,11 +54,10 @@ MIN_TARE_COUNTS = 20.0
 TARE_SIGMA_COUNTS = 1.0
 MAX_TOUCHED_SHARE = 0.25
 DRIFT_NS = 10_000_000_000
-MAX_ZEROS = 120
+MAX_ZEROS = 1200
 PLACES = {
     "saturated": " in {}: pressures end at the highest reading",
     "drifting": " in {}: tare the glove again once it is warm",
-    "ghost": " in {}: their row has a part of another one; check its wiring",
 }
 # Evaluations come once a second; one may be late.
 MAX_STEP_NS = 1_500_000_000
@@ -79,6 +78,13 @@ class GloveRecord:
     gain_counts_per_kpa: Float64[np.ndarray, " cells"]
     tare_sigma_counts: Float64[np.ndarray, " cells"]
     cells: Int64[np.ndarray, " taxels"]
+
+    def to_kpa(self, readings: np.ndarray, refused: np.ndarray) -> np.ndarray:
+        """Pressures [n, taxels] of readings [n, cells]; 0 of taxels refused or without a cell."""
+        offsets = readings[:, self.cells] - self.tare_counts[self.cells]
+        is_out = refused | (self.cells == NO_CELL)
+        gain = np.where(is_out, np.inf, self.gain_counts_per_kpa[self.cells])
+        return np.asarray(np.maximum(offsets, 0.0) / gain)
 
 
 def is_ours(descriptor: StreamDescriptor) -> bool:
@@ -285,7 +291,7 @@ class TaxelCheck(_PressureCheck):
         self._refused = none if refused is None else refused
         self._usable = ~self._refused & (self._indices != NO_CELL)
         self._drifts = none
-        # Lowest pressures of parts of 5 s, for some ten minutes.
+        # Lowest pressures of half seconds, for some ten minutes.
         self._zeros: deque[np.ndarray] = deque(maxlen=MAX_ZEROS)
         good = self._usable & (self._gain_counts_per_kpa > 0)
         self._gain_text = (
@@ -332,11 +338,14 @@ class TaxelCheck(_PressureCheck):
         judged, part = Evaluation(now_ns), self._faults
         for one in part.repeats():
             lasted_s = float(one.samples.mean()) * (now_ns - self._faults_ns) * 1e-9
+            if one.harmless:
+                judged.findings.append(Finding("frozen", "WARN", one.message))
+                continue
             judged.judge("frozen", lasted_s, one.message)
             if one.samples[-1] and one.cause == "frozen":
                 self._frozen = taxels[-1], now_ns - round(lasted_s * 1e9)
         faults = part.faults()
-        self._zeros.append(part.blocks.lows_kpa.min(axis=0))
+        self._zeros.extend(part.blocks.lows_kpa)
         drifts = drifting_taxels(np.stack(self._zeros), self._usable, self._layout)
         faults["drifting"] = self._drifts = drifts
         # At full scale they have a code of their own.
@@ -355,6 +364,7 @@ class TaxelCheck(_PressureCheck):
         if self._gain_text:
             judged.findings.append(Finding("implausible", "ERROR", self._gain_text))
         self._found, self._faults, self._faults_ns = judged.findings, self._begin(), 0
+        self._faults.blocks.follow(part.blocks)
 
     def _readings(self, values: np.ndarray) -> np.ndarray:
         taxels = values[:, self._indices]
@@ -460,14 +470,13 @@ def cell_judge(decoder: Decoder, calibration: Mapping[str, Matrix]) -> "CellChec
 
 
 def refused_taxels(
-    descriptor: StreamDescriptor, calibration: Mapping[str, Matrix]
-) -> Bool[np.ndarray, " taxels"] | None:
-    """Taxels of our own glove whose gain the calibration refused; None where it does not say."""
+    descriptor: StreamDescriptor, calibration: Mapping[str, Matrix], record: GloveRecord
+) -> Bool[np.ndarray, " taxels"]:
+    """Taxels whose gain the calibration refused."""
     states = np.array(calibration.get(f"{descriptor.name}_taxel_state", ())).ravel()
-    layout = descriptor.tactile_layout
-    if states.shape != (layout.num_raw_cells,) or descriptor.side is None:
-        return None
-    return states[layout.raw_indices(descriptor.side)] > 0
+    if states.shape != record.tare_counts.shape:
+        states = np.zeros(len(record.tare_counts))
+    return (states[record.cells] > 0) & (record.cells != NO_CELL)
 
 
 class CellCheck(_PressureCheck):

@@ -377,7 +377,11 @@ def _value_judges(
     if descriptor.kind == "tactile":
         record = glove_record(descriptor, calibration) if is_ours(descriptor) else None
         cells = (
-            TaxelCheck(record, refused_taxels(descriptor, calibration), descriptor.tactile_layout)
+            TaxelCheck(
+                record,
+                refused_taxels(descriptor, calibration, record),
+                descriptor.tactile_layout,
+            )
             if record
             else cell_judge(driver.decoder, calibration)
         )

@@ -25,7 +25,7 @@ from dextouch.streams import (
     turned_rad,
 )
 from services.acquisition.drivers.base import Driver
-from services.acquisition.health.cells import NO_CELL, GloveRecord, glove_record, is_ours
+from services.acquisition.health.cells import glove_record, refused_taxels
 from services.acquisition.health.evaluation import (
     WINDOW_NS,
     Block,
@@ -65,6 +65,8 @@ MIN_REST_SAMPLES = 40
 PLAUSIBLE_NS = 5_000_000_000
 # A content that stays for longer while its camera moves is none of now.
 MIN_STILL_S = 1.5
+# What a camera shows is told of pictures as new as this; those of H.264 are up to 8 images late.
+FRESH_NS, ENCODER_NS = 1_000_000_000, 300_000_000
 # Poses of bodies that are compared of that time.
 MAX_COMPARED = 100
 # Half seconds in which motion and touch of hands are compared.
@@ -314,9 +316,12 @@ class BodiesCheck:
         """The check of one stream."""
         return partial(self._judge, name)
 
-    def turned_rad(self, name: str, since_ns: int) -> float:
-        """By how much a tracker turned since then (5 s at most), or moved past what is 1 m away."""
-        poses = [values[t_ns >= since_ns] for t_ns, values in self._poses.get(name, ())]
+    def turned_rad(self, name: str, since_ns: int, until_ns: int) -> float:
+        """By how much a tracker turned (in the last 5 s), or moved past what is 1 m away."""
+        poses = [
+            values[(t_ns >= since_ns) & (t_ns <= until_ns)]
+            for t_ns, values in self._poses.get(name, ())
+        ]
         if not sum(map(len, poses)):
             return 0.0
         Ts = transform_from_pose(np.concatenate(poses).astype(np.float64))
@@ -351,14 +356,21 @@ class HandsCheck:
     def __init__(self, calibration: Mapping[str, Matrix]) -> None:
         self._calibration = calibration
         self._traces = HandTraces(HAND_BINS)
+        self._found, self._found_ns = self._traces.found(), -1
 
     def of(self, descriptor: StreamDescriptor) -> Callable[[Evaluation], None]:
         """The check of one stream."""
-        record = glove_record(descriptor, self._calibration) if is_ours(descriptor) else None
-        return partial(self._judge, descriptor, record)
+        record = glove_record(descriptor, self._calibration)
+        if record is None:
+            return partial(self._judge, descriptor, None)
+        refused = refused_taxels(descriptor, self._calibration, record)
+        return partial(self._judge, descriptor, partial(record.to_kpa, refused=refused))
 
     def _judge(
-        self, descriptor: StreamDescriptor, record: GloveRecord | None, evaluation: Evaluation
+        self,
+        descriptor: StreamDescriptor,
+        to_kpa: Callable[[np.ndarray], np.ndarray] | None,
+        evaluation: Evaluation,
     ) -> None:
         block, layout = evaluation.block, None
         if block.values is None or not len(block):
@@ -366,13 +378,14 @@ class HandsCheck:
         values = block.values
         if descriptor.kind == "tactile":
             layout = descriptor.tactile_layout
-            if record is not None:
-                kpa = (values - record.tare_counts) / record.gain_counts_per_kpa
-                values = np.where(record.cells == NO_CELL, 0.0, kpa[:, record.cells])
+            if to_kpa is not None:
+                values = to_kpa(values.reshape(len(values), -1))
             elif descriptor.unit != TAXEL_UNIT:
                 return
         self._traces.add(descriptor.name, block.t_host_ns, values, layout)
-        cause, message = self._traces.found().get(descriptor.name, ("", ""))
+        if evaluation.now_ns != self._found_ns:
+            self._found, self._found_ns = self._traces.found(), evaluation.now_ns
+        cause, message = self._found.get(descriptor.name, ("", ""))
         if cause:
             code = "frozen" if cause == "frozen" else "implausible"
             evaluation.findings.append(Finding(code, "ERROR", message))
@@ -407,21 +420,25 @@ class FiniteCheck:
 
 
 class CameraCheck:
-    """Judges one camera: anything is a warning, and an error after a second."""
+    """Judges one camera: anything is a warning, and by its rule an error after a second."""
 
     def __init__(self, driver: Driver, name: str, bodies: BodiesCheck | None = None) -> None:
         self._driver, self._tracker, self._bodies = driver, TRACKERS.get(name, ""), bodies
         self._since_ns: dict[str, int] = {}
+        self._newest_ns = 0
 
     def __call__(self, evaluation: Evaluation) -> None:
         """One evaluation."""
         quality, now_ns = self._driver.quality, evaluation.now_ns
         if quality is None:
             return
-        fault, clipped = quality.fault, quality.clipped_ratio
+        self._newest_ns = int(evaluation.block.t_host_ns.max(initial=self._newest_ns))
+        is_fresh = now_ns - self._newest_ns <= FRESH_NS
+        fault, clipped = quality.fault if is_fresh else None, quality.clipped_ratio
         frozen, text = quality.frozen, "the same image repeatedly"
-        if not frozen and quality.still_s > MIN_STILL_S and self._bodies is not None:
-            turned = self._bodies.turned_rad(self._tracker, now_ns - round(quality.still_s * 1e9))
+        if not frozen and is_fresh and quality.still_s > MIN_STILL_S and self._bodies is not None:
+            since_ns = self._newest_ns - round(quality.still_s * 1e9)
+            turned = self._bodies.turned_rad(self._tracker, since_ns, self._newest_ns - ENCODER_NS)
             frozen, text = turned > 2 * TURNED_RAD, "shows the same while the camera moves"
         flags = {
             "image_frozen": (frozen, text),

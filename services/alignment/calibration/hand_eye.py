@@ -53,6 +53,8 @@ ROBOT_SIGMA = (3e-4, 2e-4)
 # Corners contradict the lens by so much (px RMS, and share
 # of all): distortion or 2 % of a focal length left out. Less moves mounts within sigma.
 MIN_LENS_MISFIT_PX, MIN_LENS_SHARE = 0.15, 0.45
+# Fewer corners than that fit any lens: four views of four were refused with the right one.
+MIN_LENS_FREEDOM = 10
 # Of lengths of robot and tracker: of a base station's set-up, and a robot's nominal links.
 ROBOT_SCALE_SIGMA = 3e-3
 # Where the tracker's place is given, the effector must at least move so far in two directions.
@@ -249,7 +251,8 @@ def _check_lens(views: BoardViews, Ts_camera_board: np.ndarray) -> None:
     lens, board = known_lens_misfit(corners, views.K, views.distortion, Ts_camera_board)
     num, squares = sum(map(len, views.points_board)), lens.explained + lens.rest * lens.freedom
     off_px, rms_px = np.sqrt(np.array([lens.explained, squares]) / num)
-    if lens.p_value > MAX_CHANCE or off_px < max(MIN_LENS_MISFIT_PX, MIN_LENS_SHARE * rms_px):
+    is_decided = lens.freedom >= MIN_LENS_FREEDOM and lens.p_value <= MAX_CHANCE
+    if not is_decided or off_px < max(MIN_LENS_MISFIT_PX, MIN_LENS_SHARE * rms_px):
         return
     longer = float(np.mean(lens.coefficients[:2] / np.diag(views.K)[:2]))
     cause = (

@@ -47,8 +47,8 @@ BLOCK = 600
 
 # Why a taxel of a take is not measured: what the calibration says, that it has no reading, that its
 # readings have nothing to do with those before, lie below its tare, or are those of another one.
-REASONS = (*STATES, "absent", "random", "below_tare", "copied", "drifting", "ghost")
-ABSENT, RANDOM, BELOW_TARE, COPIED, DRIFTING, GHOST = range(len(STATES), len(REASONS))
+REASONS = (*STATES, "absent", "random", "below_tare", "copied", "drifting")
+ABSENT, RANDOM, BELOW_TARE, COPIED, DRIFTING = range(len(STATES), len(REASONS))
 NO_CELL = -1
 
 Record = Mapping[str, Sequence[Sequence[float]]]
@@ -427,8 +427,8 @@ def unusable_taxels(
     """Why each taxel of a take is unusable, index into `REASONS`; 0 if usable.
 
     Besides those that the calibration refuses: dead, stuck, random, a copy of another cell, mostly
-    below the tare, still while those around them move, at a limit for long, on a pad that drifts or
-    in a row with a ghost of another one, or NaN in more than a tenth of the samples.
+    below the tare, still while those around them move, at a limit for long, on a pad that drifts,
+    or NaN in more than a tenth of the samples.
     Raises InvalidInputError: more than half of the taxels are random, copied, dead, stuck, at a
     limit, drifting or below their tare, all are frozen, some read more than any finger presses, or
     all more than their tare.

@@ -4,7 +4,7 @@ import hashlib
 import shutil
 import sqlite3
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -15,11 +15,14 @@ import torch
 from jaxtyping import UInt8
 from torch import Tensor
 
+from dextouch.episodes import disk_errors
 from dextouch.errors import (
     CorruptDataError,
     InvalidInputError,
     LimitExceededError,
+    StorageError,
     StorageFullError,
+    UnavailableError,
 )
 from services.world_model import checkpoints
 from services.world_model.network.codecs import Latents
@@ -51,7 +54,8 @@ class LatentCache:
 
     Raises:
         CorruptDataError: another file, or a damaged one.
-        StorageFullError: no space is left.
+        StorageError: it cannot be opened or written; StorageFullError if no space is left.
+        UnavailableError: other processes write to it all the time.
     """
 
     def __init__(
@@ -64,12 +68,15 @@ class LatentCache:
             self._encoder.update(
                 tensor.cpu().contiguous().view(-1).view(torch.uint8).numpy().tobytes()
             )
-        with self._errors():
+        with disk_errors(f"make the folder of {path}"):
             path.parent.mkdir(parents=True, exist_ok=True)
+        with self._errors():
             # Written by several processes of a training, one after the other.
             self._connection = sqlite3.connect(path, timeout=60.0)
-            self._connection.execute("PRAGMA journal_mode = WAL")
             self._connection.execute(_SCHEMA)
+            # Of the file: while another process does so, too, this one has nothing to do.
+            with suppress(sqlite3.OperationalError):
+                self._connection.execute("PRAGMA journal_mode = WAL")
 
     def of(self, images: _Images, encode: Callable[[_Images], Latents]) -> Latents:
         """Latents of windows of images; those that are not there come from `encode`, one by one."""
@@ -121,13 +128,22 @@ class LatentCache:
         try:
             yield
         except sqlite3.Error as error:
-            if getattr(error, "sqlite_errorcode", 0) & 0xFF == sqlite3.SQLITE_FULL:
+            code, where = getattr(error, "sqlite_errorcode", 0) & 0xFF, f"latents in {self._path}"
+            if code == sqlite3.SQLITE_FULL:
                 raise StorageFullError(
-                    f"latents in {self._path}: no space left; free some, or use another disk"
+                    f"{where}: no space left; free some, or use another disk"
                 ) from error
-            raise CorruptDataError(
-                f"latents in {self._path}: {error}; remove the file, which is made again, or name "
-                "another one with --wan.latent-cache"
+            if code in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB):
+                raise CorruptDataError(
+                    f"{where}: {error}; remove the file, which is made again, or name another one "
+                    "with --wan.latent-cache"
+                ) from error
+            if code == sqlite3.SQLITE_BUSY:
+                raise UnavailableError(
+                    f"{where}: other processes are writing for a minute; try again"
+                ) from error
+            raise StorageError(
+                f"{where}: {error}; name a file on a local disk that can be written"
             ) from error
 
 
@@ -136,7 +152,7 @@ def use_latent_cache(model: JointWorldModel, files: WanFiles, *, adds: bool = Tr
 
     Raises:
         InvalidInputError: a model whose own linear codec is faster than a cache.
-        CorruptDataError, StorageFullError: as `LatentCache`.
+        StorageError, UnavailableError: as `LatentCache`.
     """
     if files.latent_cache is None:
         return
@@ -180,6 +196,8 @@ def fill_latent_cache(
         )
     if settings.init is not None:
         model = checkpoints.read_checkpoint(settings.init).model
+        if model.text_features is not None:
+            model.text_features.use(settings.wan.folder, settings.wan.text_cache)
     else:
         model = initial_codec(config, settings.wan)
     use_latent_cache(model, settings.wan)
@@ -195,14 +213,14 @@ def fill_latent_cache(
             f"latents in {path}: {num_windows} windows need {needed / 1e9:.1f} GB, expected at "
             f"most the {free / 1e9:.1f} GB that are free; use another disk, or fewer episodes"
         )
-    instructions = set[str]()
+    one_each = {place.episode_index: place for place in places}
+    instructions = {trained[i].cut(place).request.instruction for i, place in one_each.items()}
+    if model.text_features is not None and settings.wan.text_cache is not None:
+        model.text_features.stack(sorted(instructions))
     for place in track(places):
         window = trained[place.episode_index].cut(place)
         views = [window.images, *([] if window.further is None else window.further)]
         model.encode_images(torch.from_numpy(np.stack(views)).to(settings.device))
-        instructions.add(window.request.instruction)
-    if model.text_features is not None and settings.wan.text_cache is not None:
-        model.text_features.stack(sorted(instructions))
     return CachedWindows(path, len(trained), num_windows, len(instructions))
 
 

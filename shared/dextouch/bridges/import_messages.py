@@ -77,10 +77,14 @@ class Form:
         shape = self.shape[1:] if self.is_padded else self.shape
         by_name = self.kind == "robot_state" and len({*self.names}) == len(self.names)
         names = tuple(sorted(self.names)) if by_name else self.names
-        return self.kind, self.unit, self.dtype, shape, self.frame, names
+        # Where whole numbers of a source do not all fit int64, it is float64.
+        dtype = "float64" if self.dtype == "int64" else self.dtype
+        return self.kind, self.unit, dtype, shape, self.frame, names
 
     def fit(self, values: np.ndarray, other: "Form") -> np.ndarray:
         """Values of a sample of another form that `matches`: joints in order, points padded."""
+        if self.dtype != other.dtype:
+            values = values.astype(self.dtype)
         if self.names != other.names:
             return values[[other.names.index(name) for name in self.names]]
         if self.is_padded and len(values) < self.shape[0]:
@@ -90,8 +94,9 @@ class Form:
         return values
 
     def describe(self) -> str:
-        """Unit and shape, for messages."""
-        return f"{self.unit} {list(self.shape)}" + (f" in {self.frame!r}" if self.frame else "")
+        """Unit, type of numbers and shape, for messages."""
+        unit = f"{self.unit} {self.dtype}" if self.unit == NUMBERS_UNIT else self.unit
+        return f"{unit} {list(self.shape)}" + (f" in {self.frame!r}" if self.frame else "")
 
 
 @dataclass(frozen=True)

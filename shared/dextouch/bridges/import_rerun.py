@@ -471,16 +471,16 @@ def _numbers(row: Row, known: Known, frame: str | None) -> Iterator[Item]:
         ):
             raise InvalidInputError(f"component {name}, which this release does not read")
         numbers = _flat(value)
-        if numbers.dtype == np.uint64 and numbers.max() > np.iinfo(np.int64).max:
-            raise InvalidInputError(f"component {name}: numbers above 2^63, which no stream can")
-        numbers = numbers.astype("<i8" if numbers.dtype.kind in "iu" else "<f8")
+        is_large = numbers.dtype == np.uint64 and numbers.max() > np.iinfo(np.int64).max
+        notes = ("above 2^53, rounded",) if is_large else ()
+        numbers = numbers.astype("<i8" if numbers.dtype.kind in "iu" and not is_large else "<f8")
         if len(numbers) > MAX_POINTS:
             raise InvalidInputError(f"{len(numbers)} numbers, expected at most {MAX_POINTS}")
         is_scalars = _archetype(name) == "Scalars"
         said = "" if is_scalars else f"component {name}"
         dtype = numbers.dtype.name
         form = Form("scalar", NUMBERS_UNIT, dtype, numbers.shape, frame, as_numbers=said)
-        yield _item(form, numbers.copy, "Scalars" if is_scalars else name)
+        yield _item(replace(form, notes=notes), numbers.copy, "Scalars" if is_scalars else name)
 
 
 def _pinhole(known: Known) -> CameraModel | None:

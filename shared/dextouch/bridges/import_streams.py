@@ -56,6 +56,7 @@ MAX_PENDING: Final = 4096
 MIN_RATE_HZ, MAX_RATE_HZ = 1e-6, 10_000.0
 _MAX_REASONS = 8
 _NO_IMAGE: Final = "packet without an image (before a key frame, or damaged)"
+_MIXED: Final = "float64, as not all samples are int64; rounded above 2^53"
 _SIDES = ("left", "right")
 # Names of rectified images, as image_proc of ROS has them: image_rect, image_rect_color.
 _RECTIFIED: Final = re.compile(r"(^|[/_])rect(ified)?([/_]|$)")
@@ -85,7 +86,7 @@ def mapped_form(
     """Form, conversion and side of a source that is mapped to one of our own streams.
 
     Streams of other names stay as they are. Floats as touch are the taxels of a layout in kPa,
-    integers the counts of its raw cells.
+    integers the counts of its raw cells, unless there are as many as taxels.
 
     Raises InvalidInputError for a source that cannot be that stream.
     """
@@ -93,7 +94,7 @@ def mapped_form(
     numbers = form.kind != "image"
     size = math.prod(form.shape)
     if name.startswith("tactile_") and side:
-        is_float = form.dtype.startswith("float")
+        is_float = form.dtype.startswith("float") or size == layout.num_taxels
         count = layout.num_taxels if is_float else layout.num_raw_cells
         what = "taxels in kPa" if is_float else "raw cells"
         wanted = f"the {count} {what} of {layout.name!r} (--layout)"
@@ -164,9 +165,11 @@ class _Part:
         for index, (form, count) in enumerate(self.forms):
             if form.matches(item.form):
                 longest = form if form.shape[:1] >= item.form.shape[:1] else item.form
-                if form.notes != item.form.notes:
-                    notes = tuple(dict.fromkeys((*form.notes, *item.form.notes)))
-                    longest = replace(longest, notes=notes[:_MAX_REASONS])
+                mixed = (_MIXED,) if form.dtype != item.form.dtype else ()
+                if mixed or form.notes != item.form.notes:
+                    notes = tuple(dict.fromkeys((*form.notes, *item.form.notes, *mixed)))
+                    dtype = "float64" if mixed else form.dtype
+                    longest = replace(longest, notes=notes[:_MAX_REASONS], dtype=dtype)
                 self.forms[index] = (longest, count + 1)
                 break
         else:

@@ -293,8 +293,10 @@ class ObjectStorage:
         group = group_key(kind, item_id)
         self._bucket.put(f"{group}/{CLAIM_FILE}", _DELETING)
         self._bucket.remove([f"{group}/{COMMIT_FILE}"])
-        _announce(self._bucket, group)
-        _remove_files(self._bucket, group, [facts.key for facts in self._bucket.list(group)])
+        try:
+            _remove_files(self._bucket, group, [facts.key for facts in self._bucket.list(group)])
+        finally:
+            _announce(self._bucket, group)
 
     def set_remark(self, kind: Kind, item_id: str, name: str, content: bytes | None) -> None:
         """Put a file beside the content in place of an earlier one; None removes it."""
@@ -450,15 +452,18 @@ def sweep_orphans(bucket: Bucket, *, now: datetime | None = None) -> int:
                 _remove_files(bucket, group, keys)
                 removed += 1
     changes = sorted(_announced(bucket), key=lambda facts: facts.modified)
-    bucket.remove([facts.key for facts in changes[:-1] if facts.modified < limit])
+    try:
+        bucket.remove([facts.key for facts in changes[:-1] if facts.modified < limit])
+    except StorageError as error:
+        logger.warning("changes_not_removed", reason=error.message)
     return removed
 
 
 def _announce(bucket: Bucket, group: str) -> None:
-    """Tell catalogs that a group was changed; without the permission they find it by its id."""
+    """Tell catalogs that a group was changed; if that fails, they find it when they list all."""
     try:
         bucket.put(f"{CHANGES}/{group}/{uuid.uuid4().hex}", b"")
-    except StorageError as error:
+    except (StorageError, UnavailableError) as error:
         logger.warning("change_not_announced", group=group, reason=error.message)
 
 

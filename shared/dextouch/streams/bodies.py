@@ -197,7 +197,8 @@ def _check_commanded(bodies: _Bodies) -> ImplausibleBody | None:
             continue
         ways_m = [np.ptp(bodies.at_m(of), axis=0).max() for of in (name, name + COMMANDED)]
         if ways_m[0] < MAX_STILL_M and ways_m[1] > MIN_COMMANDED_M:
-            text = f"stands still while it is commanded over {ways_m[1]:.2f} m: restart its tracker"
+            text = f"stands still while it is commanded over {ways_m[1]:.2f} m"
+            text += ": check that it is enabled and reports its pose"
             return ImplausibleBody(name, "frozen", text)
         turns = [(bodies.changed(_TURNS[one], name).as_commanded(name), one) for one in _TURNS]
         share, turn = max(turns)

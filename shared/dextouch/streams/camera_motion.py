@@ -1,11 +1,12 @@
 """Compares what a camera's pictures show with how the camera moved: still, turned, late, another's.
 
-A picture flows (Lucas and Kanade, 1981, over the whole picture) as its camera turns, and as it
-moves past a scene at one depth, which is unknown. What hands do in the picture is noise here.
+A picture flows (Lucas and Kanade, 1981, in parts of the picture, of which the median is taken) as
+its camera turns, and as it moves past a scene at one depth, which is unknown. Hands that fill half
+of the picture and more may flow otherwise: nothing that is said here makes a take a bad one.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
@@ -21,21 +22,25 @@ TRACKERS: Final = {
     "camera_wrist_left": "wrist_left",
     "camera_wrist_right": "wrist_right",
 }
-_AS_READ: Final = "as they are"
+_AS_READ: Final = "as_they_are"
 # How images may be turned or mirrored against their camera's matrix; x is right and y down.
 TURNS: Final[Mapping[str, tuple[tuple[int, int], tuple[int, int]]]] = {
     _AS_READ: ((1, 0), (0, 1)),
-    "mirrored, left for right": ((-1, 0), (0, 1)),
-    "mirrored, top for bottom": ((1, 0), (0, -1)),
-    "turned by 180 degrees": ((-1, 0), (0, -1)),
-    "turned by 90 degrees clockwise": ((0, -1), (1, 0)),
-    "turned by 90 degrees anticlockwise": ((0, 1), (-1, 0)),
+    "mirrored_left_for_right": ((-1, 0), (0, 1)),
+    "mirrored_top_for_bottom": ((1, 0), (0, -1)),
+    "turned_by_180_degrees": ((-1, 0), (0, -1)),
+    "turned_by_90_degrees_clockwise": ((0, -1), (1, 0)),
+    "turned_by_90_degrees_anticlockwise": ((0, 1), (-1, 0)),
     "transposed": ((0, 1), (1, 0)),
-    "transposed and turned by 180 degrees": ((0, -1), (-1, 0)),
+    "transposed_and_turned_by_180_degrees": ((0, -1), (-1, 0)),
 }
-# Share of the flow that a reading explains if it is right, and if it is wrong: 0.26 … 0.97 and up
-# to 0.1 in the twin, where both axes move. Readings that explain as much less are as likely.
-RIGHT_SHARE, WRONG_SHARE, MIN_APART = 0.35, 0.1, 0.25
+# Share of the flow that a reading explains if it is right, and if it is wrong. Hands that the head
+# follows explain up to 0.5 of a wrong lag. Readings that explain as much less are as likely.
+RIGHT_SHARE, WRONG_SHARE, MIN_APART = 0.65, 0.1, 0.25
+# Parts of a picture, of 4 by 4 blocks, and the RMS change of levels from block to block along the
+# evener axis that tells how one flows; half of them must.
+PARTS: Final = (5, 7)
+MIN_SLOPE: Final = 1.0
 # Flows are as large as they are predicted, or as near scenes are; chance makes them much smaller.
 MIN_WEIGHT: Final = 0.2
 # Predicted flow of an image, RMS, below which a camera stands still: 0.5 px of VGA at 500 px.
@@ -45,6 +50,9 @@ MIN_VIEW_IMAGES: Final = 60
 # and its size, as cameras without a calibrated latency are as late as an image takes.
 MAX_LAG_S, LAG_STEP_S = 0.4, 0.01
 MIN_GAIN, LAG_SIGMAS, MIN_LAG_S = 0.25, 4.0, 0.035
+# What moves by itself, such as hands that the head follows, shifts a lag by some of this times the
+# share that it leaves unexplained.
+OWN_MOTION_S: Final = 0.3
 NUM_PARTS: Final = 6
 # While a camera turns by so much in a second, or moves past what is a metre away, its picture is
 # off by 30 px of VGA at 500 px, and changes by more than noise does; in so many images at least.
@@ -62,19 +70,30 @@ class View:
     size_px: tuple[int, int]
 
     def flow(self) -> Float64[np.ndarray, "steps 2"]:
-        """Mean flow of the picture from image to image, right and down, in focal lengths."""
+        """Median flow of parts of the picture from image to image, right and down.
+
+        In focal lengths; NaN where less than half of the parts have edges.
+        """
         middle = (self.pictures[1:] + self.pictures[:-1]) / 2
         change = np.diff(self.pictures, axis=0)
-        change = (change - change.mean(axis=(1, 2), keepdims=True))[:, 1:-1, 1:-1]
-        x = (middle[:, 1:-1, 2:] - middle[:, 1:-1, :-2]) / 2
-        y = (middle[:, 2:, 1:-1] - middle[:, :-2, 1:-1]) / 2
-        slopes = np.stack([x, y], axis=-1, dtype=np.float64).reshape(len(change), -1, 2)
-        A = np.swapaxes(slopes, 1, 2) @ slopes
-        # A picture without edges flows nowhere.
-        A += (0.02 * np.trace(A, axis1=1, axis2=2) + 1)[:, None, None] * np.eye(2)
-        b = -np.swapaxes(slopes, 1, 2) @ change.reshape(len(change), -1, 1)
+        change -= np.median(change, axis=(1, 2), keepdims=True)
+        x = (middle[:, 2:-2, 3:-1] - middle[:, 2:-2, 1:-3]) / 2
+        y = (middle[:, 3:-1, 2:-2] - middle[:, 1:-3, 2:-2]) / 2
+        rows, columns = PARTS
+        # By step, part and block: both slopes and the change.
+        values = np.stack([x, y, change[:, 2:-2, 2:-2]], axis=-1, dtype=np.float64)
+        values = values.reshape(len(x), rows, x.shape[1] // rows, columns, -1, 3)
+        values = values.swapaxes(2, 3).reshape(len(x), rows * columns, -1, 3)
+        slopes = values[..., :2]
+        A = slopes.swapaxes(2, 3) @ slopes
+        sure = np.linalg.eigvalsh(A)[..., 0] > MIN_SLOPE**2 * slopes.shape[2]
+        A += 1e-9 * np.eye(2)
+        flow = np.linalg.solve(A, -slopes.swapaxes(2, 3) @ values[..., 2:])[..., 0]
+        flow[~sure] = np.nan
+        known = sure.mean(axis=1) >= 0.5
+        blocks = np.full((len(x), 2), np.nan)
+        blocks[known] = np.nanmedian(flow[known], axis=1)
         (height, width), (focal_x, focal_y) = self.size_px, np.diag(self.K)[:2]
-        blocks = np.linalg.solve(A, b)[..., 0]
         return np.asarray(blocks * [width / COLUMNS / focal_x, height / ROWS / focal_y])
 
 
@@ -132,29 +151,48 @@ class ViewFaults:
 
     Attributes:
         still_share: of the images before which the camera turned, those that are the same.
-        turn: how the images are turned or mirrored.
-        like: another camera whose motion the pictures show, and not that of their own.
+        looks: how the images may be turned or mirrored, or the camera with which they may have been
+            exchanged, with the share of the flow that this explains.
         lag_s: by how much images show what was before their time, with its standard deviation.
     """
 
     still_share: float | None = None
-    turn: str | None = None
-    like: str | None = None
+    looks: Mapping[str, float] = field(default_factory=dict)
     lag_s: tuple[float, float] | None = None
 
 
-def view_faults(name: str, view: View, motions: Mapping[str, CameraMotion]) -> ViewFaults:
-    """Compare the pictures of the camera `name` with its motion, and with those of others."""
+def view_faults(
+    views: Mapping[str, View], motions: Mapping[str, CameraMotion]
+) -> dict[str, ViewFaults]:
+    """Compare the pictures of each camera with its motion, and with those of others.
+
+    Cameras are exchanged if each has the pictures of the other.
+    """
+    found = {name: _view_faults(name, view, motions) for name, view in views.items()}
+
+    def agreed(name: str, what: str) -> bool:
+        return what in TURNS or (what in found and name in found[what].looks)
+
+    return {
+        name: replace(one, looks={w: share for w, share in one.looks.items() if agreed(name, w)})
+        for name, one in found.items()
+    }
+
+
+def _view_faults(name: str, view: View, motions: Mapping[str, CameraMotion]) -> ViewFaults:
     motion, margin_ns = motions[name], round(MAX_LAG_S * 1e9)
     inside = view.t_ns >= motion.t_ns[0] + margin_ns
     inside &= view.t_ns <= motion.t_ns[-1] - margin_ns
     view = View(view.t_ns[inside], view.pictures[inside], view.K, view.size_px)
     if len(view.t_ns) < MIN_VIEW_IMAGES:
         return ViewFaults()
-    still_share = _still_share(view, motion)
+    still_share, flow = _still_share(view, motion), view.flow()
     # Across a pause there is no flow.
     known = np.diff(view.t_ns) < 2 * np.median(np.diff(view.t_ns))
-    flow, predicted = view.flow()[known], motion.flow(view.t_ns)[known]
+    known &= np.isfinite(flow).all(axis=1)
+    if np.count_nonzero(known) < MIN_VIEW_IMAGES:
+        return ViewFaults(still_share)
+    flow, predicted = flow[known], motion.flow(view.t_ns)[known]
     lags = _Lags(view.t_ns, flow, motion, known)
     shares = {turn: _explained(flow, predicted, turn) for turn in TURNS}
     others = {n: _explained(flow, one.flow(view.t_ns)[known]) for n, one in motions.items()}
@@ -162,13 +200,13 @@ def view_faults(name: str, view: View, motions: Mapping[str, CameraMotion]) -> V
     # What is late may look turned in a motion to and fro.
     least = max(RIGHT_SHARE, shares[_AS_READ] + MIN_APART, lags.share + WRONG_SHARE)
     if others[like] > max(least, shares[turn]):
-        return ViewFaults(still_share, like=like)
+        return ViewFaults(still_share, {like: others[like]})
     halves = np.array_split(np.arange(len(flow)), 2)
     if shares[turn] > least and all(
         _explained(flow[p], predicted[p], turn) > _explained(flow[p], predicted[p]) for p in halves
     ):
-        near = (one for one in TURNS if shares[one] > shares[turn] - MIN_APART)
-        return ViewFaults(still_share, " or ".join(near))
+        near = {one: share for one, share in shares.items() if share > shares[turn] - MIN_APART}
+        return ViewFaults(still_share, near)
     return ViewFaults(still_share, lag_s=lags.sure(shares[_AS_READ]))
 
 
@@ -210,5 +248,6 @@ class _Lags:
         rows = np.arange(len(self._flow))
         parts = np.array_split(rows, NUM_PARTS)
         left_out = [self._best(np.setdiff1d(rows, part))[0] for part in parts]
-        sigma_s = max(float(np.sqrt((NUM_PARTS - 1) * np.var(left_out))), LAG_STEP_S / 10)
+        scatter_s = float(np.sqrt((NUM_PARTS - 1) * np.var(left_out)))
+        sigma_s = max(LAG_STEP_S / 10, float(np.hypot(scatter_s, OWN_MOTION_S * (1 - self.share))))
         return (self.lag_s, sigma_s) if abs(self.lag_s) > LAG_SIGMAS * sigma_s else None

@@ -21,14 +21,14 @@ ALONE: Final = 1 / 3
 # hits among five fingers by chance have a probability of 0.2**8.
 MIN_HITS: Final = 4
 MAX_OWN_SHARE: Final = 0.1
-# A tracker stands still if means of half seconds differ as those of white noise do (1, with a
-# scatter of 0.5), in all columns, while fingers of its hand open or close by so much. Poses without
-# any noise were filled in, not tracked.
-MAX_SLOW: Final = 3.0
+# A tracker stands still if means of half seconds scatter by less than those of any living hand (m,
+# and parts of quaternions) for ten seconds, while fingers of its hand open or close by so much.
+# Noise of more hides how a hand lives, or is a hand that shakes; poses without any were filled in,
+# or are rounded.
+LEAST_LIFE: Final = np.array([5e-5] * 3 + [2.5e-4] * 4)
+MIN_STILL_BINS: Final = 20
 MIN_CLOSING_M: Final = 0.02
-LEAST_NOISE: Final = 1e-6
-# Tremor moves every hand by more (m, and parts of quaternions).
-LEAST_LIFE: Final = np.array([2e-4] * 3 + [1e-3] * 4)
+NOISE_M: Final = (1e-6, 5e-4)
 
 
 class HandTraces:
@@ -97,17 +97,13 @@ class HandTraces:
         wrist, keypoints = f"wrist_{side}", f"keypoints_{side}"
         if not (means := self._means(wrist, keypoints)):
             return False
-        closing_m = np.ptp(means[keypoints], axis=0).max()
         rows = np.stack([*self._bins[wrist].values()])
-        count, (some, squares) = rows[:, :1], np.split(rows[:, 1:], 2, axis=1)
-        noise = (squares - some**2 / count).sum(axis=0) / count.sum()
-        if noise.max() < LEAST_NOISE**2:
+        count, (some, squares) = rows[:, :1], np.split(rows[:, 1:] / rows[:, :1], 2, axis=1)
+        noise_m = np.sqrt(np.maximum(squares - some**2, 0.0))[count[:, 0] > 1, :3]
+        if len(noise_m) < MIN_STILL_BINS or np.ptp(means[keypoints], axis=0).max() < MIN_CLOSING_M:
             return False
-        noise = np.maximum(noise, LEAST_NOISE**2)
-        slow = ((some / count - some.sum(axis=0) / count.sum()) ** 2 * count).mean(axis=0) / noise
-        least = np.ptp(some / count, axis=0).reshape(7) / LEAST_LIFE
-        is_still = slow.max() < MAX_SLOW or least.max() < 1
-        return bool(closing_m > MIN_CLOSING_M and is_still)
+        has_noise = np.median(noise_m, axis=0).min() > NOISE_M[0] and noise_m.max() < NOISE_M[1]
+        return bool(has_noise and (some.std(axis=0) < LEAST_LIFE).all())
 
     def _exchanged_pads(self, side: str) -> tuple[str, str] | None:
         names = f"tactile_{side}", f"keypoints_{side}"
@@ -131,15 +127,7 @@ class HandTraces:
         moved = np.maximum(curls_m.max(axis=2), np.linalg.norm(at_m[..., :3], axis=2))
         touched = force_n.sum(axis=2)
         hits = _hits(_alone(touched, MIN_TOUCH_N), _alone(moved, MIN_MOVE_M), 2)
-        if _are_exchanged(hits):
-            return True
-        # One hand that is still all the time is touched, and the other one never touches anything.
-        for still, other in ((0, 1), (1, 0)):
-            is_still = moved[:, still].max() < ALONE * MIN_MOVE_M
-            untouched = touched[:, other].max() < ALONE * MIN_TOUCH_N
-            if is_still and untouched and hits[still, other] >= MIN_HITS / 2:
-                return True
-        return False
+        return _are_exchanged(hits)
 
 
 def _alone(amounts: np.ndarray, least: float) -> np.ndarray:

@@ -4,6 +4,7 @@ Stations apply it to the last seconds, alignment to recordings. Noise of sensors
 averages out over a block of a copy, so that equal contents look equal.
 """
 
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
@@ -14,8 +15,6 @@ from dextouch.streams.repeats import ImageFault, spread
 IMAGE_FAULTS: Final[dict[ImageFault, str]] = {
     "black": "black images between others",
     "torn": "images with rows of another, or without content",
-    "older": "images that came before",
-    "mixed": "images out of order, or of two cameras",
     "pumping": "images whose light pumps",
 }
 PICTURE_SHAPE = ROWS, COLUMNS = 24, 32
@@ -23,8 +22,7 @@ PICTURE_SHAPE = ROWS, COLUMNS = 24, 32
 _SAMPLES: Final = 8
 _LEAST_IMAGES: Final = 6
 # Blocks of quiet sensors and encoders scatter by so many levels, and what moves by times as much.
-NOISE_LEVELS: Final = 0.25
-MOVES: Final = 5.0
+NOISE_LEVELS, MOVES = 0.25, 5.0
 # Sensors have a pedestal of some levels at most; rooms are brighter than the second.
 DARK_LEVEL, LIT_LEVEL = 8.0, 30.0
 # What decoders write where data ends: grey, nothing, or the green of zeros in YUV. It is more even
@@ -34,12 +32,9 @@ EVEN_LEVELS: Final = 1.0
 MIN_ROWS: Final = 3
 # Rows of another image are off both neighbours by times what these are off each other, and more:
 # in a motion that goes on they are off by half of it.
-ALIEN, ALIEN_LEVELS = 1.6, 8.0
-# An older image comes again from a buffer of so many.
-MAX_BUFFER: Final = 32
-# Motion that goes on makes two steps of a picture longer than one. Of alternating cameras and
-# exchanged images two steps are shorter, by this factor at least.
-BACK_SHARE: Final = 0.8
+ALIEN, ALIEN_LEVELS = 1.6, 6.0
+# Light that is switched off stays off for longer: a second at 30 Hz.
+MAX_BLACK: Final = 30
 # Light of all blocks alike changes by so much in one image, both ways, in a second of pumping.
 PUMPED: Final = 0.04
 MIN_PUMPED: Final = 2
@@ -68,29 +63,26 @@ def image_faults(
 ) -> dict[ImageFault, Bool[np.ndarray, " n"]]:
     """Which of consecutive pictures, by `thumbnail`, have a fault of `IMAGE_FAULTS`; one at most.
 
-    Rows that stay those of the image before are no fault: they may show what stands still.
+    Rows that stay those of the image before are no fault: they may show what stands still. Nor is a
+    picture that came before, or out of order: a finger that taps or a wheel shows the same.
     """
     count, found = len(pictures), dict[ImageFault, np.ndarray]()
     if count < _LEAST_IMAGES:
         return found
     means = pictures.mean(axis=(1, 2))
-    found["black"] = (means < DARK_LEVEL) & (np.median(means) > LIT_LEVEL)
+    dark, found["black"] = means < DARK_LEVEL, np.zeros(count, dtype=bool)
+    turns = np.flatnonzero(np.diff(dark)) + 1
+    for first, stop in pairwise(turns.tolist()):
+        found["black"][first:stop] = dark[first] and stop - first <= MAX_BLACK
+    found["black"] &= np.median(means) > LIT_LEVEL
     found["torn"] = _filled(pictures[:, -MIN_ROWS:].reshape(count, -1)) & ~found["black"]
-    ordinary = np.flatnonzero(~found["black"] & ~found["torn"])
+    ordinary = np.flatnonzero(~dark & ~found["torn"])
     pictures = pictures[ordinary]
     if len(pictures) >= _LEAST_IMAGES:
-        steps, two = (apart(pictures[by:], pictures[:-by]) for by in (1, 2))
-        noise = noise_levels(pictures)
-        rest: dict[ImageFault, np.ndarray] = {
-            "mixed": _mixed(steps, two, noise),
-            "torn": _alien(pictures),
-            "older": _older(pictures, steps, noise),
-            "pumping": _pumping(pictures),
-        }
-        taken = np.zeros(count, dtype=bool)
-        for name, marked in rest.items():
-            new = spread(marked, ordinary, count) & ~taken
-            found[name], taken = found.get(name, np.zeros(count, dtype=bool)) | new, taken | new
+        pumping = _pumping(pictures)
+        # Light that pumps makes rows unlike others, too.
+        found["torn"] |= spread(_alien(pictures) & ~pumping.any(), ordinary, count)
+        found["pumping"] = spread(pumping, ordinary, count)
     return {name: marked for name, marked in found.items() if marked.any()}
 
 
@@ -108,11 +100,9 @@ def _filled(last: np.ndarray) -> Bool[np.ndarray, " n"]:
 def noise_levels(pictures: Float32[np.ndarray, "n 24 32"]) -> float:
     """Mean difference of two pictures of the same: what the quietest blocks turn back and forth."""
     turns = np.abs(pictures[2:] - 2 * pictures[1:-1] + pictures[:-2])
-    # Those of two cameras in turn.
-    again = np.abs(pictures[2:] - pictures[:-2])
     # Second differences of noise are √3 times first ones, whose mean is 1.18 times their median.
-    turn, step = (float(np.percentile(np.median(x, axis=0), 5)) for x in (turns, again))
-    return max(NOISE_LEVELS, 1.18 * min(turn / 3**0.5, step))
+    turn = float(np.percentile(np.median(turns, axis=0), 5))
+    return max(NOISE_LEVELS, 1.18 * turn / 3**0.5)
 
 
 def is_same_picture(one: np.ndarray, other: np.ndarray) -> bool:
@@ -122,43 +112,17 @@ def is_same_picture(one: np.ndarray, other: np.ndarray) -> bool:
 
 def _alien(pictures: np.ndarray) -> Bool[np.ndarray, " n"]:
     """Pictures whose upper or lower rows are unlike those of the images beside, which are alike."""
-    step = np.abs(np.diff(pictures, axis=0)).mean(axis=2)
-    two = np.abs(pictures[2:] - pictures[:-2]).mean(axis=2)
+    # Half of a row: no hand that shows for an image.
+    step = np.median(np.abs(np.diff(pictures, axis=0)), axis=2)
+    two = np.median(np.abs(pictures[2:] - pictures[:-2]), axis=2)
     alien = np.minimum(step[:-1], step[1:]) > ALIEN * two + ALIEN_LEVELS
     count = alien.sum(axis=1)
     # From the first such row down, or from the last one up; some may look alike.
     heights = [ROWS - rows.argmax(axis=1) for rows in (alien, alien[:, ::-1])]
     torn = count >= 0.75 * np.minimum(*heights)
-    return np.pad(torn & (count >= MIN_ROWS) & (count <= ROWS - MIN_ROWS), 1)
-
-
-def _older(pictures: np.ndarray, steps: np.ndarray, noise: float) -> Bool[np.ndarray, " n"]:
-    """Pictures that came before, though others move; not those of a motion that turns back."""
-    older = np.zeros(len(pictures), dtype=bool)
-    for at in (np.flatnonzero(steps[1:] > MOVES * noise) + 2).tolist():
-        first = max(0, at - MAX_BUFFER)
-        distances = apart(pictures[first : at - 1], pictures[at])
-        same = first + int(distances.argmin())
-        if distances.min() < min(2 * noise, 0.2 * steps[at - 1]):
-            turns = same > 0 and at + 1 < len(pictures)
-            turns = turns and apart(pictures[at + 1], pictures[same - 1]) < (
-                BACK_SHARE * steps[same - 1]
-            )
-            older[at] = not turns
-    return older
-
-
-def _mixed(steps: np.ndarray, two: np.ndarray, noise: float) -> Bool[np.ndarray, " n"]:
-    """Pairs whose first is further from the picture before than its second is, and the reverse.
-
-    A motion that turns back once has no such pair.
-    """
-    mixed = np.zeros(len(steps) + 1, dtype=bool)
-    before, after = steps[:-2], steps[2:]
-    mixed[1:-2] = (two[:-1] < BACK_SHARE * before) & (two[1:] < BACK_SHARE * after)
-    mixed[1:-2] &= np.minimum(before, after) > MOVES * noise
-    mixed[2:] |= mixed[1:-1]
-    return mixed
+    # Rolling shutters in light that flickers show bands in image after image.
+    alone = np.convolve(count >= MIN_ROWS, np.ones(min(9, len(count))), mode="same") < 2
+    return np.pad(torn & alone & (count >= MIN_ROWS) & (count <= ROWS - MIN_ROWS), 1)
 
 
 def _pumping(pictures: np.ndarray) -> Bool[np.ndarray, " n"]:

@@ -7,7 +7,7 @@ from typing import Final, Literal
 import numpy as np
 from jaxtyping import Bool, Float64
 
-ImageFault = Literal["black", "torn", "older", "mixed", "pumping"]
+ImageFault = Literal["black", "torn", "pumping"]
 ImplausibleCause = (
     Literal["unit", "norm", "speed", "limits", "jump", "frozen", "repeated"] | ImageFault
 )

@@ -1,7 +1,5 @@
 """Figures of short blocks of a glove's readings, and the faults of many taxels that these show."""
 
-from functools import lru_cache
-from itertools import chain, permutations
 from statistics import NormalDist
 from typing import Final
 
@@ -15,48 +13,45 @@ BLOCK_ROWS: Final = 30
 # A frozen glove with dither: almost all taxels stay within one count of their middle, half of them
 # reach both sides, and normal noise that is off by one as often would be off by two in so many
 # readings. Noise of which so many are expected has fewer than 16 (5 % of the taxels may be faulty)
-# with a probability of 1e-12. Where taxels at rest have such noise while others move, it is theirs.
+# with a probability of 1e-12. Where taxels at rest have such noise while others move, it is theirs;
+# firmware that clamps noise makes it. A glove that never moved may have it.
 FROZEN_TAXELS: Final = 0.95
 DITHERED_TAXELS: Final = 0.5
 MIN_EXPECTED: Final = 60.0
 MAX_OWN_SHARE: Final = 0.1
+MOVING_TAXELS: Final = 0.99
+RESTING_TAXELS: Final = 0.05
 # The zero of a pad drifts if its lows rise (or fall) by as much as a contact, of which an eighth at
 # either end is not seen, little by little and alike. A contact is there within half a second, and
-# presses the middle of a pad more.
+# presses the middle of a pad more. A grip that is slowly pressed harder is never let go: what
+# touches a drifting pad comes and goes twice at least, and presses some taxels more than others by
+# half of the drift. Pads of few taxels are always alike.
 ZERO_PARTS: Final = 8
+# 20 s: a glove that warms up takes minutes, and a grip seconds.
+MIN_ZERO_BLOCKS: Final = 40
 MIN_DRIFT_KPA: Final = 0.75 * CONTACT_THRESHOLD_KPA
 MAX_PART_OF_DRIFT: Final = 0.5
 MAX_UNLIKE: Final = 0.35
-# Three taxels that end at the same reading share a limit, two where converters end (2^n - 1): it is
-# read in so many samples, and more often than all that is within 2 % below.
+MIN_PAD_TAXELS: Final = 9
+MIN_RELEASES: Final = 2
+MIN_TOUCH_SHARE: Final = 0.5
+# Taxels that share a limit end at the highest reading of all, five of them, or three where
+# converters end (2^n - 1): it is read in so many samples, and more often than all within 2 % below.
+# Of other readings with less than three steps there nothing is known: a steady grip is as flat.
 MIN_TOP_ROWS: Final = 30
 MIN_TOP_SHARE: Final = 0.02
 NEAR_TOP: Final = 0.98
-MIN_SAME_TOPS: Final = 3
+MIN_STEPS_NEAR_TOP: Final = 3
+MIN_SAME_TOPS: Final = 5
+MIN_SAME_CEILINGS: Final = 3
 CEILINGS: Final = 2.0 ** np.arange(8, 17) - 1
-# A ghost of a row: wherever that row is pressed, the other one reads the same share of it at least,
-# in six columns, though what presses moves along the row, and the taxel between both reads less,
-# which what presses both would press more. Next to each other nothing is between.
-MIN_GHOST: Final = 0.07
-MAX_GHOST: Final = 0.65
-MIN_GHOST_KPA: Final = 2.5
-ROUNDING_KPA: Final = 0.2
-GHOST_TOLERANCE: Final = 0.15
-BETWEEN: Final = 0.8
-ROUNDING: Final = 0.01
-GHOST_SHARE: Final = 0.7
-GHOST_FOLLOWS: Final = 0.95
-MIN_GHOST_COLUMNS: Final = 6
-MIN_GHOST_READINGS: Final = 8
-MIN_GHOST_MOVE: Final = 0.7
-MAX_KEPT_ROWS: Final = 2000
-KEEP_EVERY: Final = 5
 _NORMAL: Final = NormalDist()
 # Pressures of gains that are entered in another unit are off by its size, which gains of one kind
 # of glove are not. What makes more than 3 kPa of a kPa is a pressure that was divided by its unit.
 PER_UNIT_KPA: Final = {"psi": 6.895, "bar": 100.0, "MPa": 1000.0}
 MAX_OFF_UNIT: Final = 1.25
-# A glove of 16 bits has a full scale above 50 kPa.
+MIN_OFF: Final = 3.0
+# No grip stays below it; gloves of a smaller range have it in their layout.
 MIN_FULL_SCALE_KPA: Final = 50.0
 
 
@@ -66,6 +61,8 @@ def implausible_gain(
     """Why gains of some taxels with these areas are in another unit; None if they are not."""
     full_scale_kpa = layout.full_scale / float(np.median(gain_counts_per_kpa))
     ratio = full_scale_kpa / layout.range_kpa
+    if 1 / MIN_OFF < ratio < MIN_OFF:
+        return None
     units = {f"counts/{name}": 1 / size for name, size in PER_UNIT_KPA.items()}
     units |= {"counts/N": float(np.median(areas_m2)) * 1e3, "psi taken for kPa": 6.895}
     unit = min(units, key=lambda name: abs(float(np.log(ratio / units[name]))))
@@ -99,12 +96,12 @@ class TaxelBlocks:
         self._gain, self._usable = gain_counts_per_kpa, usable
         self._step, self._layout = step, layout
         self._dithers: list[np.ndarray] = []
-        self._num_dithered = self._num_own = 0
+        self.num_moved = self.num_own = 0
         self._lows: list[np.ndarray] = []
-        self._kept: list[np.ndarray] = []
-        self._keep_every, self._num_rows = KEEP_EVERY, 0
+        self._num_rows = 0
         num_taxels = len(gain_counts_per_kpa)
         self._top = np.full(num_taxels, -np.inf)
+        self._least_step = np.full(num_taxels, np.inf)
         self._num_top, self._num_near, self._span = np.zeros((3, num_taxels))
 
     def add(self, counts: np.ndarray, offsets: np.ndarray) -> None:
@@ -115,12 +112,7 @@ class TaxelBlocks:
             self._lows.append(np.nan_to_num(kpa).min(axis=0).astype(np.float32))
             if not self._note_dither(counts[part]):
                 self._note_top(counts[part], offsets[part])
-        first = -self._num_rows % self._keep_every
-        self._kept.append((offsets[first :: self._keep_every] / self._gain).astype(np.float32))
         self._num_rows += len(counts)
-        if sum(map(len, self._kept)) > MAX_KEPT_ROWS:
-            self._kept = [np.concatenate(self._kept)[::2]]
-            self._keep_every *= 2
 
     def _note_dither(self, counts: np.ndarray) -> bool:
         steps = counts[:, self._usable] / self._step
@@ -133,17 +125,20 @@ class TaxelBlocks:
         if 0 < share < 1:
             sigma = 0.5 / _NORMAL.inv_cdf(1 - share / 2)
             expected = 2 * _NORMAL.cdf(-1.5 / sigma) * near.sum() * len(steps)
-        is_bounded = expected > MIN_EXPECTED or (share == 1.0 and both.any())
+        is_bounded = expected > MIN_EXPECTED * near.mean() or (share == 1.0 and both.any())
         is_frozen = bool(
             is_bounded and near.mean() >= FROZEN_TAXELS and both.mean() >= DITHERED_TAXELS
         )
-        self._num_dithered += is_frozen
-        self._num_own += is_bounded and not is_frozen
+        self.num_moved += not is_frozen and bool(near.mean() < MOVING_TAXELS)
+        self.num_own += is_bounded and not is_frozen and bool(near.mean() > RESTING_TAXELS)
         self._dithers.append(np.full(len(counts), is_frozen))
         return is_frozen
 
     def _note_top(self, counts: np.ndarray, offsets: np.ndarray) -> None:
         top = np.fmax(self._top, np.fmax.reduce(counts, axis=0))
+        steps = np.abs(np.diff(counts, axis=0))
+        least = np.fmin.reduce(steps, axis=0, where=steps > 0, initial=np.inf)
+        self._least_step = np.minimum(self._least_step, least)
         self._num_top[top > self._top] = 0
         self._top = top
         self._num_top += (counts == top).sum(axis=0)
@@ -158,102 +153,57 @@ class TaxelBlocks:
     def dithered(self) -> Bool[np.ndarray, " n"]:
         """Samples of a glove that is frozen but for a count."""
         found = np.concatenate(self._dithers) if self._dithers else np.zeros(0, dtype=bool)
-        return found & (self._num_own <= MAX_OWN_SHARE * self._num_dithered)
+        return found & (self.num_own <= MAX_OWN_SHARE * self.num_moved)
+
+    def follow(self, before: "TaxelBlocks") -> None:
+        """Take over what an earlier part says of how the glove moves, and of its own noise."""
+        self.num_moved, self.num_own = before.num_moved, before.num_own
 
     def clipped(self) -> Bool[np.ndarray, " taxels"]:
         """Taxels whose pressures were higher than what is read, for long."""
         least = max(MIN_TOP_ROWS, MIN_TOP_SHARE * self._num_rows)
         flat = (self._num_top >= least) & (self._span > CONTACT_THRESHOLD_KPA * self._gain)
         flat &= (self._num_top > self._num_near) & self._usable
-        tops, inverse, same = np.unique(self._top, return_inverse=True, return_counts=True)
-        same = np.bincount(inverse, weights=flat, minlength=len(tops))
-        is_limit = same >= np.where(np.isin(tops, CEILINGS), 2, MIN_SAME_TOPS)
-        is_limit |= tops >= self._layout.full_scale - self._step / 2
-        return np.asarray(flat & is_limit[inverse])
-
-    def ghosts(self) -> Bool[np.ndarray, " taxels"]:
-        """Taxels of rows that hold a part of another row."""
-        kpa = np.concatenate(self._kept) if self._kept else np.zeros((0, len(self._gain)))
-        # The last column stands for no taxel between.
-        kpa = np.pad(kpa, ((0, 0), (0, 1)), constant_values=np.inf)
-        shares = [
-            (_ghost_share(*(kpa[:, some] for some in rows)), rows[1])
-            for rows in _pairs_of_rows(self._layout)
-        ]
-        found = np.zeros(len(self._gain), dtype=bool)
-        for share, other in sorted(shares, key=lambda of: -of[0]):
-            # Rows of a pad and scan lines have taxels in common.
-            if share and not found[other].any():
-                found[other] = True
-        return found & self._usable
-
-
-@lru_cache(maxsize=8)
-def _pairs_of_rows(layout: TactileLayout) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Taxels of a row, of another one, and between both (-1 of none), of pads and scan lines."""
-    stacks = layout.split(np.arange(layout.num_taxels))
-    lines = [np.swapaxes(stack, 0, 1).reshape(stack.shape[1], -1) for stack in stacks]
-    if layout == DEXTOUCH_V1:
-        # Lines that are scanned cross the rows of the palm.
-        lines.append(stacks[-1].reshape(12, 20))
-    pads = np.repeat(np.arange(len(layout.pads)), [pad.num_taxels for pad in layout.pads])
-    grids = np.concatenate([np.indices(pad.shape).reshape(2, -1) for pad in layout.pads], axis=1)
-    at = {place: taxel for taxel, place in enumerate(zip(pads, *grids, strict=True))}
-    found = []
-    for one, other in chain.from_iterable(permutations(rows, 2) for rows in lines):
-        middle = zip(pads[one], *((grids[:, one] + grids[:, other]) // 2), strict=True)
-        between = np.array([at.get(place, -1) for place in middle])
-        apart = np.abs(grids[:, other] - grids[:, one]).max(axis=0)
-        found.append((one, other, np.where(apart > 1, between, -1)))
-    return found
-
-
-def _ghost_share(pressed: np.ndarray, ghost: np.ndarray, between: np.ndarray) -> float:
-    """Which share of one row another row reads at least, whatever presses the one; 0 of none."""
-    is_pressed = pressed > MIN_GHOST_KPA
-    asked = is_pressed & (between < BETWEEN * ghost) & (ghost > ROUNDING_KPA)
-    columns = np.flatnonzero(asked.sum(axis=0) >= MIN_GHOST_READINGS)
-    if len(columns) < MIN_GHOST_COLUMNS:
-        return 0.0
-    ratios = np.where(asked, ghost / np.maximum(pressed, MIN_GHOST_KPA), np.nan)[:, columns]
-    least = np.nanpercentile(ratios, 5, axis=0)
-    share = float(np.median(least))
-    if not MIN_GHOST <= share <= MAX_GHOST:
-        return 0.0
-    fits = np.abs(least - share) <= GHOST_TOLERANCE * share + ROUNDING
-    weights = np.where(asked, pressed, 0.0)[asked.any(axis=1)]
-    centres = weights @ np.arange(pressed.shape[1]) / weights.sum(axis=1)
-    follows = (ghost >= share / 2 * pressed)[is_pressed].mean() >= GHOST_FOLLOWS
-    enough = fits.sum() >= max(MIN_GHOST_COLUMNS, GHOST_SHARE * len(columns))
-    return share if follows and enough and centres.std() >= MIN_GHOST_MOVE else 0.0
+        is_full = self._top >= self._layout.full_scale - self._step / 2
+        steps_near_top = (1 - NEAR_TOP) * self._span / self._least_step
+        others = self._usable & ~is_full & np.isfinite(self._least_step)
+        limit = self._top.max(where=others, initial=-np.inf)
+        is_ceiling = limit in CEILINGS
+        at_limit = flat & others & (self._top == limit)
+        at_limit &= is_ceiling | (steps_near_top >= MIN_STEPS_NEAR_TOP)
+        is_limit = at_limit.sum() >= (MIN_SAME_CEILINGS if is_ceiling else MIN_SAME_TOPS)
+        return np.asarray(flat & is_full | at_limit & is_limit)
 
 
 def drifting_taxels(
     lows_kpa: np.ndarray, usable: Bool[np.ndarray, " taxels"], layout: TactileLayout = DEXTOUCH_V1
 ) -> Bool[np.ndarray, " taxels"]:
-    """Taxels of pads whose zero moves, by the lowest pressures of parts of a take [parts, taxels].
+    """Taxels of pads whose zero moves, by the lowest pressures of half seconds [parts, taxels].
 
-    A pad that is touched from some moment on, or as slowly as a drift in its middle, is none.
+    A pad is judged that is touched and let go meanwhile: else a slow grip may be all that moves it.
     """
     found = np.zeros(lows_kpa.shape[1], dtype=bool)
-    if len(lows_kpa) < ZERO_PARTS:
+    if len(lows_kpa) < MIN_ZERO_BLOCKS:
         return found
-    lows = np.stack([part.min(axis=0) for part in np.array_split(lows_kpa, ZERO_PARTS)])
+    ends = np.linspace(0, len(lows_kpa) - 1, ZERO_PARTS + 1).round().astype(int)
     # What touches a pad hides its zero for a while.
-    rising = np.minimum.accumulate(lows[::-1], axis=0)[::-1]
-    falling = np.minimum.accumulate(lows, axis=0)
+    rising = np.minimum.accumulate(lows_kpa[::-1], axis=0)[::-1]
+    falling = np.minimum.accumulate(lows_kpa, axis=0)
     for pad, first in zip(layout.pads, layout.starts, strict=True):
         taxels = first + np.flatnonzero(usable[first : first + pad.num_taxels])
-        if len(taxels) < pad.num_taxels / 2:
+        if len(taxels) < max(MIN_PAD_TAXELS, pad.num_taxels / 2):
             continue
-        for zeros in (rising[:, taxels], falling[:, taxels]):
-            steps = np.abs(np.diff(np.percentile(zeros, 25, axis=1)))
-            each = np.abs(zeros[-1] - zeros[0])
+        for zeros, parts in ((rising[:, taxels], ends[:-1]), (falling[:, taxels], ends[1:])):
+            steps = np.abs(np.diff(np.percentile(zeros[parts], 25, axis=1)))
+            each = np.abs(zeros[parts[-1]] - zeros[parts[0]])
             unlike = float(np.subtract(*np.percentile(each, [90, 10])))
+            above_kpa = np.subtract(*np.percentile(lows_kpa[:, taxels] - zeros, [90, 10], axis=1))
+            touched = above_kpa > max(MIN_TOUCH_SHARE * steps.sum(), CONTACT_THRESHOLD_KPA)
             if (
                 steps.sum() >= MIN_DRIFT_KPA
                 and steps.max() <= MAX_PART_OF_DRIFT * steps.sum()
                 and unlike <= MAX_UNLIKE * steps.sum()
+                and (touched[:-1] & ~touched[1:]).sum() >= MIN_RELEASES
             ):
                 found[taxels] = True
     return found

@@ -200,7 +200,7 @@ class TaxelFaults:
         dithered = self.blocks.dithered()
         if dithered.any():
             text = f"readings stay within a count of the same in {dithered.sum()} samples"
-            return [Implausible("frozen", text, dithered, whole=bool(dithered.all()))]
+            return [Implausible("frozen", text, dithered, harmless=not self.blocks.num_moved)]
         keys = np.concatenate(self._keys) if self._keys else np.zeros(0, dtype=np.uint64)
         is_new = np.append(True, keys[1:] != keys[:-1])
         turns = self._turns[self._usable]
@@ -228,7 +228,6 @@ class TaxelFaults:
             "stuck": silent,
             "saturated": self.blocks.clipped(),
             "drifting": drifting_taxels(self.blocks.lows_kpa, self._usable, self._layout),
-            "ghost": self.blocks.ghosts(),
         }
 
     def _ended(self) -> Bool[np.ndarray, " taxels"]:

@@ -294,8 +294,9 @@ def test_bad_images_warn_and_are_an_error_after_a_second(change, code):
     judge = CameraCheck(driver, "camera_head")
     assert judged(judge, block([]), 0).findings == []
     driver.quality = ImageQuality(**change)
-    seen = [codes(judged(judge, block([]), t * SECOND_NS)) for t in (1, 2)]
-    assert seen == [{code: "WARN"}, {code: "ERROR"}]
+    seen = [codes(judged(judge, block([t]), t * SECOND_NS)) for t in (1, 2)]
+    # Light that pumps is of no camera's making.
+    assert seen == [{code: "WARN"}, {code: "WARN" if code == "image_content" else "ERROR"}]
     driver.quality = ImageQuality()
     assert judged(judge, block([]), 3 * SECOND_NS).findings == []
 
@@ -305,12 +306,23 @@ def test_a_picture_that_stays_while_its_camera_moves_is_frozen():
     judge, tracker = CameraCheck(driver, "camera_head", bodies), bodies.of("head")
     driver.quality = ImageQuality(still_s=2.0)
     for turn_rad, expected in ((0.01, {}), (0.3, {"image_frozen": "WARN"})):
-        t_ns = np.arange(100) * SECOND_NS // 100
+        t_s = np.arange(100) / 100
         angles = np.linspace(0, turn_rad, 100) / 2
         poses = np.zeros((100, 7))
         poses[:, 3], poses[:, 6] = np.cos(angles), np.sin(angles)
-        judged(tracker, block(t_ns, poses), SECOND_NS)
-        assert codes(judged(judge, block([]), SECOND_NS)) == expected
+        judged(tracker, block(t_s, poses), SECOND_NS)
+        assert codes(judged(judge, block(t_s), SECOND_NS)) == expected
+    # What moved when the picture was still in its encoder, or after the camera went silent.
+    judged(tracker, block(t_s + 1, poses), 2 * SECOND_NS)
+    driver.quality = ImageQuality(still_s=2.0, fault="torn")
+    judge = CameraCheck(driver, "camera_head", bodies)
+    assert codes(judged(judge, block([]), 2 * SECOND_NS)) == {}
+    driver.quality = ImageQuality(still_s=1.6)
+    bodies = BodiesCheck({})
+    judge, tracker = CameraCheck(driver, "camera_head", bodies), bodies.of("head")
+    poses[:70], poses[70:, 3:] = [0, 0, 0, 1, 0, 0, 0], [0.5**0.5, 0, 0, 0.5**0.5]
+    judged(tracker, block(t_s, poses), SECOND_NS)
+    assert codes(judged(judge, block(t_s), SECOND_NS)) == {}
 
 
 def test_blocks_are_bounded_and_count_what_they_lose():

@@ -15,7 +15,13 @@ from services.alignment.calibration.bundle import (
     predicted_jacobians,
     solve_bundle,
 )
-from services.alignment.calibration.hand_eye import BoardViews, polish, project, solve_hand_eye
+from services.alignment.calibration.hand_eye import (
+    BoardViews,
+    _check_lens,
+    polish,
+    project,
+    solve_hand_eye,
+)
 from services.alignment.calibration.motion import (
     adjoint,
     check_turns,
@@ -225,6 +231,19 @@ def test_views_may_have_different_numbers_of_corners():
         alone = views.only(np.array([k])).measurement(0.3)(B[k : k + 1])
         np.testing.assert_allclose(some.information[k], alone.information[0])
         np.testing.assert_allclose(some.gradient[k], alone.gradient[0])
+
+
+@pytest.mark.parametrize("num_views", [4, 6])
+def test_few_corners_say_nothing_against_a_lens(num_views):
+    """A square marker has four; their poses leave less than ten of the residuals free."""
+    for seed in range(10):
+        views = make_scene(seed, Motion(num_views=num_views)).views
+        # The corners of the 9 x 6 board.
+        corners = np.array([0, 8, 45, 53])
+        pixels = [one[corners] for one in views.pixels_px]
+        few = BoardViews([one[corners] for one in views.points_board], pixels, K, DISTORTION)
+        scene = make_scene(seed, Motion(num_views=num_views))
+        _check_lens(few, polish(few.measurement(1.0), scene.Ts_camera_board))
 
 
 def test_the_gate_lets_two_axes_pass():

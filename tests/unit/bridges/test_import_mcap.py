@@ -14,6 +14,7 @@ from dextouch.bridges import import_mcap, import_streams
 from dextouch.bridges.import_mcap import import_any_mcap
 from dextouch.bridges.import_messages import items_of
 from dextouch.bridges.import_recording import ImportAttributes
+from dextouch.bridges.import_streams import mapped_form
 from dextouch.bridges.mcap import export_mcap, records
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import CorruptDataError, InvalidInputError
@@ -115,7 +116,7 @@ def test_json_by_the_documented_schemas_and_of_anyone(store, tmp_path):
     (glove,) = (one for one in report.imported if one.stream == "glove")
     assert glove.num_repeated_stamps == 1
     reasons = {(one.source, one.num_samples): one.reason for one in report.refused}
-    assert "numbers [1]" in reasons["/glove", 1]
+    assert "numbers float64 [1]" in reasons["/glove", 1]
     assert "not JSON" in reasons["/bare", 1]
 
 
@@ -243,7 +244,7 @@ def test_joints_of_one_name_are_not_mistaken_for_each_other(store, tmp_path):
     assert store.recording("j").values("j", 0, 2).tolist() == [[1, 2, 3], [4, 5, 6]]
     reasons = {one.source: one.reason for one in report.refused}
     assert "of other names" in reasons["/j"]
-    assert reasons["/none"] == "samples without a number, numbers [0, 1]"
+    assert reasons["/none"] == "samples without a number, numbers float32 [0, 1]"
 
 
 def stripped(reader, store, folder, name):
@@ -337,6 +338,33 @@ def test_whole_numbers_of_a_message_stay_whole(store, tmp_path):
     assert recording.values("m1", 0, 1).tolist() == [[2**60 + 1, 5]]
     assert recording.values("m2", 0, 1).tolist() == [[3, 0.5]]
     assert [one.notes for one in report.imported if one.notes] == [("above 2^53, rounded: u",)]
+
+
+def test_whole_numbers_beyond_int64_make_their_topic_float64(store, tmp_path):
+    pytest.importorskip("mcap_ros2")
+    recorder, numbers = Recorder(tmp_path / "a.mcap"), [7, 2**64 - 1, 2**60, 2**63 - 1, 2**63]
+    recorder.channel("/u", "lab/msg/U", "ros2msg", b"uint64 u", "cdr")
+    for k, number in enumerate(numbers):
+        recorder.raw("/u", b"\0\1\0\0" + struct.pack("<Q", number), T0 + k)
+    report = import_any_mcap(recorder.done(), store, ImportAttributes())
+    assert not report.refused
+    assert store.recording("a").values("u", 0, 5)[:, 0].tolist() == [float(n) for n in numbers]
+    assert "float64, as not all samples are int64; rounded above 2^53" in report.imported[0].notes
+
+
+@pytest.mark.parametrize(
+    ("count", "unit", "dtype"), [(320, "kPa", "float32"), (360, "counts", "int64")]
+)
+@pytest.mark.parametrize("is_typed", [True, False])
+def test_whole_numbers_as_touch_are_what_their_count_says(count, unit, dtype, is_typed):
+    (item,) = items_of("lab/Touch", {"p": list(range(count))}, is_typed=is_typed)
+    if count == 360 and not is_typed:
+        with pytest.raises(InvalidInputError, match=r"numbers float64 \[360\], expected the 320"):
+            mapped_form("tactile_left", item.form)
+        return
+    form, convert, _ = mapped_form("tactile_left", item.form)
+    assert (form.unit, form.dtype) == (unit, dtype)
+    assert convert(item.decode()).tolist() == list(range(count))
 
 
 def test_rectified_images_have_the_matrix_of_their_projection(store, tmp_path):

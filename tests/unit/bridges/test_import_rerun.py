@@ -174,13 +174,17 @@ def test_parts_that_a_row_clears_have_their_defaults_and_whole_numbers_are_exact
     at(stream, 1)
     stream.log("hand", rr.Transform3D.from_fields(clear_unset=True, translation=[1, 2, 3]))
     stream.log("stamp", rr.AnyValues(ns=T0 + 1))
-    stream.log("big", rr.AnyValues(big=np.array([2**63], dtype=np.uint64)))
+    for number in (2**63, 2**60, 5):
+        stream.log("big", rr.AnyValues(big=np.array([number], dtype=np.uint64)))
     stream.disconnect()
     report = import_rrd(tmp_path / "a.rrd", store, ImportAttributes())
     assert store.recording("a").values("stamp", 0, 1).tolist() == [[T0 + 1]]
     poses = store.recording("a").values("hand", 0, 2)
     np.testing.assert_allclose(poses, [[0, 0, 0, 0.8, 0, 0, 0.6], [1, 2, 3, 1, 0, 0, 0]], atol=1e-6)
-    assert [one.source for one in report.refused] == ["/big"]
+    assert store.recording("a").values("big", 0, 3)[:, 0].tolist() == [2.0**63, 2.0**60, 5.0]
+    notes = {one.source: one.notes for one in report.imported}
+    assert not report.refused
+    assert notes["/big"][0] == "above 2^53, rounded"
 
 
 def test_what_is_left_out_is_said(store, tmp_path):

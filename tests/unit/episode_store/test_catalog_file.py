@@ -408,13 +408,20 @@ def test_changes_of_a_bucket_are_found_without_listing_it(in_bucket, tmp_path, m
     # Another process of this computer reads on where this one ended.
     catalog = Catalog(ours)
     assert (found(), asked) == (["a", "b", "d", "r"], [".changes"])
+    assert [catalog.index.num_items(kind) for kind in ("episode", "recording")] == [3, 1]
     # What an earlier release commits is found by the list that follows.
+    catalog.index.check()
     put_as_before(theirs, ["e"], tmp_path / "local")
     assert found() == ["a", "b", "d", "r"]
     later_s = time.time() + catalog_index.BUCKET_CHECK_PERIOD_S
     monkeypatch.setattr(catalog_index.time, "time", lambda: later_s)
-    assert found() == ["a", "b", "d", "e", "r"]
+    # And what was announced since is compared, too: a list of ids shows neither.
+    theirs.set_review("b", REJECTED)
+    theirs.delete("a")
+    upload_item(theirs, "episode", "a", task="again")
+    assert found(review="rejected") == ["b"]
     assert "episodes" in asked
+    assert (found(task="again"), found()) == (["a"], ["a", "b", "d", "e", "r"])
 
 
 def test_the_last_change_of_a_bucket_stays(in_bucket):
@@ -465,3 +472,15 @@ def test_a_bucket_whose_policy_allows_items_alone(in_bucket, monkeypatch, now_ns
     now_ns[0] += catalog_index.BUCKET_PERIOD_NS
     assert ids(catalog) == ["a", "b"]
     assert ours.sweep() == 0
+
+
+def test_a_bucket_whose_policy_refuses_deletions_can_be_swept(in_bucket, monkeypatch):
+    store = in_bucket("work")
+    upload_item(store, "episode", "a")
+    time.sleep(1.1)  # what the server rounds times to
+    upload_item(store, "episode", "b")
+    refused = StorageError("delete .changes: refused (403 AccessDenied)")
+    monkeypatch.setattr(Bucket, "remove", lambda *_: (_ for _ in ()).throw(refused))
+    with capture_logs() as logs:
+        assert sweep_orphans(store._storage._bucket, now=datetime.now(UTC) + 2 * ORPHAN_AGE) == 0
+    assert [entry["event"] for entry in logs] == ["changes_not_removed"]

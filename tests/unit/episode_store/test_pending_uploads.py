@@ -73,6 +73,15 @@ def test_what_failed_is_uploaded_when_the_bucket_is_back(s3_server, store):
     assert store.open(made.attributes.episode_id).verify()
 
 
+def test_a_sweep_that_fails_is_not_tried_again_at_once(store, monkeypatch):
+    """It lists the whole bucket."""
+    pending, failure = PendingUploads(store), UnavailableError("list: no answer")
+    monkeypatch.setattr(store, "sweep", lambda: (_ for _ in ()).throw(failure))
+    with pytest.raises(UnavailableError):
+        pending.work()
+    pending.work()
+
+
 def test_a_take_that_waits_is_no_conflict(s3_server, store):
     made = episode_of()
     fail_to_upload(s3_server, store, made)

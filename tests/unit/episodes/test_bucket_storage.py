@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import zarr
 from obstore.store import S3Store
+from structlog.testing import capture_logs
 from zarr.storage import ObjectStore
 
 from dextouch.episodes import EpisodeStore
@@ -22,7 +23,7 @@ from dextouch.errors import (
     StorageError,
     UnavailableError,
 )
-from dextouch.schemas import RecordingAttributes
+from dextouch.schemas import RecordingAttributes, Review
 from dextouch.streams import StreamDescriptor
 from tests.contracts.s3_server import CREDENTIALS, running_s3
 from tests.unit.episodes.conftest import episode_of
@@ -193,6 +194,26 @@ def test_deleting_takes_the_commit_record_first_and_the_claim_last(store, monkey
     assert removed[-1] == ["claim"]
     assert len(removed) == 3
     assert store.list() == []
+
+
+def test_a_change_that_cannot_be_announced_is_made_all_the_same(store, bucket, monkeypatch, made):
+    """What a catalog is told is no part of the change: an overloaded service costs an entry."""
+    put = Bucket.put
+
+    def overloaded(self, key, *args, **options):
+        if key.startswith(".changes"):
+            raise UnavailableError(f"write {key}: no answer (503 SlowDown)")
+        return put(self, key, *args, **options)
+
+    monkeypatch.setattr(Bucket, "put", overloaded)
+    with capture_logs() as logs:
+        made.write(store)
+        store.set_review(
+            EPISODE, Review(verdict="rejected", reviewer="ada", reviewed_at=datetime.now(UTC))
+        )
+        store.delete(EPISODE)
+    assert [entry["event"] for entry in logs] == ["change_not_announced"] * 3
+    assert not list(bucket.list("episodes"))
 
 
 def test_what_could_not_be_uploaded_waits(s3_server, store, made):

@@ -60,7 +60,7 @@ def test_mock_gloves_with_any_noise_have_no_fault(noise):
         assert "frozen" not in found(calibration, rest)
 
 
-@pytest.mark.parametrize("since", [0, 400, 900], ids=["all", "most", "a part"])
+@pytest.mark.parametrize("since", [400, 900], ids=["most", "a part"])
 @pytest.mark.parametrize("dither", [(-1, 0, 1), (-1, 1), (-1, 0, 0, 1)], ids=str)
 def test_a_frozen_glove_with_dither(since, dither):
     for seed in SEEDS:
@@ -68,9 +68,48 @@ def test_a_frozen_glove_with_dither(since, dither):
         rng = np.random.default_rng(seed)
         counts[since:] = counts[since] + rng.choice(dither, counts[since:].shape)
         assert abs(len(found(calibration, counts)["frozen"]) - (1440 - since)) <= 60
+        # A glove that never moves may be one whose firmware clamps noise.
+        (one,) = taxel_faults(calibration, [counts[since:]]).repeats()
+        assert one.cause == "frozen"
+        assert one.harmless
 
 
-@pytest.mark.parametrize(("kpa", "least"), [(4.0, 6), (10.0, 18), (25.0, 18)])
+@pytest.mark.parametrize("touched_s", [0, 1, 10])
+def test_a_glove_that_clamps_noise_and_is_hardly_touched_is_not_frozen(touched_s):
+    for seed in SEEDS:
+        calibration, clean = take(seed, noise=0.0)
+        rng = np.random.default_rng(seed)
+        dither = [rng.choice((-1, 0, 1), clean.shape), np.rint(rng.uniform(-1.2, 1.2, clean.shape))]
+        counts = np.tile(clean[:1], (len(clean), 1)) + dither[seed % 2]
+        pressed = rng.random(360) < [0.3, 0.9][seed // 2 % 2]
+        at = slice(600, 600 + 60 * touched_s)
+        wave = np.sin(np.arange(60 * touched_s) / 20) ** 2
+        counts[at] += np.rint(800 * wave[:, None] * pressed)
+        assert "frozen" not in found(calibration, counts)
+
+
+@pytest.mark.parametrize("full_scale", [255, 1023, 4095])
+@pytest.mark.parametrize("noise", [0.0, 0.3, 1.0])
+def test_a_steady_grip_on_a_glove_of_few_levels_is_at_no_limit(full_scale, noise):
+    layout = DEXTOUCH_V1.model_copy(update={"full_scale": float(full_scale), "range_kpa": 500.0})
+    t_s = np.arange(1200)[:, None] / 60
+    held = np.clip((t_s - 2) / 0.5, 0, 1) * np.clip((18 - t_s) / 0.5, 0, 1)
+    for seed in SEEDS:
+        rng = np.random.default_rng(seed)
+        kpa = np.where(rng.random(320) < 0.35, rng.uniform(5, 80, 320), 0)
+        tare = np.round(rng.uniform(5, 15, 320))
+        gain = full_scale / 500 * rng.uniform(0.9, 1.1, 320)
+        counts = tare + gain * kpa * held * (1 + 0.005 * np.sin(t_s))
+        counts = np.rint(counts + noise * rng.standard_normal(counts.shape)).clip(0, full_scale)
+        # Of a glove that sends N, by 0.05 N.
+        for step, unit in ((1.0, 1.0), (0.05, 0.05 * 255 / full_scale)):
+            faults = TaxelFaults(tare * unit, gain * unit, layout=layout, step=step / 10)
+            faults.add(counts * unit)
+            said = faults.faults()
+            assert not (said["saturated"] | said["drifting"]).any()
+
+
+@pytest.mark.parametrize(("kpa", "least"), [(4.0, 12), (10.0, 18), (25.0, 18)])
 @pytest.mark.parametrize("bend", [0.0, 2.0])
 def test_the_zero_of_a_pad_that_drifts(kpa, least, bend):
     hits = 0
@@ -92,6 +131,22 @@ def test_a_pad_that_is_touched_more_and_more_does_not_drift():
     lows[:, 16:32] = np.linspace(0, 20, 40)[:, None] * bump
     usable = np.ones(320, dtype=bool)
     assert not drifting_taxels(lows, usable).any()
+    # Something soft is pressed harder and harder, by the whole hand or a finger, with a tremor.
+    for taxels in (slice(0, 320), slice(16, 32)):
+        for way in (np.linspace(0, 25, 80), np.linspace(25, 5, 80)):
+            squeeze = np.zeros((80, 320))
+            squeeze[:, taxels] = (way * (1 + 0.2 * np.sin(np.arange(80))))[:, None]
+            assert not drifting_taxels(squeeze, usable).any()
+            # It is kneaded, and never let go.
+            squeeze[:, taxels] += 50 * (np.arange(80) % 8 == 4)[:, None]
+            assert not drifting_taxels(squeeze, usable).any()
+    # Pads of few taxels are often alike, let go or not.
+    pads = [pad.model_dump() | {"rows": 2, "columns": 2} for pad in DEXTOUCH_V1.pads]
+    cells = {side: tuple(range(24)) for side in ("left", "right")}
+    few = DEXTOUCH_V1.model_copy(update={"pads": pads, "raw_cells": cells, "num_raw_cells": 24})
+    taps = np.linspace(0, 25, 80)[:, None] * np.ones(24)
+    taps[4::8, ::4] += 50
+    assert not drifting_taxels(taps, usable[:24], few).any()
     lows[:, 16:32] = np.where(np.arange(40) < 20, 0, 20)[:, None]
     assert not drifting_taxels(lows, usable).any()
 
@@ -103,20 +158,6 @@ def test_readings_that_end_at_a_limit(top):
         ends = (counts >= top).mean(axis=0)[calibration.cells]
         named = found(calibration, np.minimum(counts, top))["saturated"]
         assert set(np.flatnonzero(ends > 0.05)) <= set(named) <= set(np.flatnonzero(ends > 0.01))
-
-
-@pytest.mark.parametrize(("share", "least"), [(0.1, 7), (0.25, 11), (0.5, 13)])
-def test_a_row_that_holds_a_part_of_another_one(share, least):
-    hits = 0
-    for seed in SEEDS:
-        calibration, counts = take(seed)
-        one, other = np.random.default_rng(seed).permutation(15)[:2]
-        rows = [calibration.cells[80 + 16 * row + np.arange(16)] for row in (one, other)]
-        tare = np.zeros(360)
-        tare[calibration.cells] = calibration.tare_counts
-        counts[:, rows[1]] += np.rint(share * (counts[:, rows[0]] - tare[rows[0]]))
-        hits += other in (found(calibration, counts).get("ghost", np.zeros(0)) - 80) // 16
-    assert hits >= least, hits
 
 
 @pytest.mark.parametrize(
@@ -132,6 +173,10 @@ def test_gains_in_another_unit_are_named(factor, said):
         gain = GloveCalibration.seeded("left", seed).gain_counts_per_kpa
         assert implausible_gain(gain[:320], areas_m2) is None
         assert f"these look like {said}" in implausible_gain(gain[:320] * factor, areas_m2)
+    # Gloves of a small range, and of taxels so large that a newton is about a kPa.
+    small = DEXTOUCH_V1.model_copy(update={"range_kpa": 40.0, "full_scale": 4095.0})
+    assert implausible_gain(np.full(320, 4095 / 40), areas_m2, small) is None
+    assert implausible_gain(np.full(320, 4095 / 40), np.full(320, 9e-4), small) is None
     matrices = GloveCalibration.seeded("left", 0).matrices("left")
     name = "tactile_left_gain_counts_per_kpa"
     scaled = matrices | {name: matrix_rows(np.array(matrices[name]) * factor)}
@@ -148,11 +193,11 @@ def live(change, *, gain=1.0, seconds=64):
     gains = made.gain_counts_per_kpa * gain
     check = TaxelCheck(GloveRecord(made.tare_counts, gains, np.zeros(360), cells))
     counts, said = change(calibration, counts), {}
-    for second in range(seconds):
+    for second in range(len(counts) // 60):
         part = slice(60 * second, 60 * second + 60)
         t_s = np.arange(part.start, part.stop) / 60
         evaluation = judged(check, block(t_s, counts[part].astype(np.uint16)), round(1e9 * t_s[-1]))
-        said |= {f.message: f.code for f in evaluation.findings if f.code != "baseline"}
+        said |= {f.message: (f.code, f.level) for f in evaluation.findings if f.code != "baseline"}
     return said
 
 
@@ -169,7 +214,10 @@ def test_the_health_of_a_station_names_the_same():
         return counts
 
     assert live(same) == {}
-    assert "frozen" in live(dithered).values()
+    assert set(live(dithered).values()) == {("frozen", "ERROR")}
+    # Before it has moved it may be at rest, and clamp its noise.
+    resting = live(lambda _, counts: dithered(_, counts)[1200:], seconds=40)
+    assert set(resting.values()) == {("frozen", "WARN")}
     assert any("16 taxels are drifting in index" in text for text in live(drifting))
     clipped = live(lambda _, counts: np.minimum(counts, 255), seconds=10)
     assert any("are saturated in" in text for text in clipped)
@@ -179,4 +227,4 @@ def test_the_health_of_a_station_names_the_same():
 def test_taxels_that_say_nothing_are_no_fault():
     faults = TaxelFaults(np.full(320, 120.0), np.full(320, 40.0))
     faults.add(np.full((40, 320), np.nan))
-    assert not any(faults.faults()[name].any() for name in ("saturated", "drifting", "ghost"))
+    assert not any(faults.faults()[name].any() for name in ("saturated", "drifting"))

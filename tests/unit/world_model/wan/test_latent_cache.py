@@ -2,6 +2,8 @@
 
 import shutil
 import sqlite3
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import pytest
 import torch
@@ -10,14 +12,17 @@ from dextouch.errors import (
     CorruptDataError,
     InvalidInputError,
     LimitExceededError,
+    StorageError,
     StorageFullError,
 )
 from services.world_model.checkpoints import read_checkpoint
 from services.world_model.network.configuration import WanFiles
+from services.world_model.network.instruction import key_of
 from services.world_model.paper_settings import OptimizerSettings, TrainSettings, WindowSettings
 from services.world_model.pretrained_video import initial_codec
 from services.world_model.training import latent_cache
 from services.world_model.training.joint_trainer import train_on
+from services.world_model.training.latent_cache import LatentCache
 
 
 @pytest.fixture
@@ -154,6 +159,39 @@ def test_damage_and_foreign_files_are_refused_and_a_full_disk_is_named(
     monkeypatch.setattr(latent_cache.shutil, "disk_usage", lambda _: usage)
     with pytest.raises(LimitExceededError, match=r"74 windows need 0\.0 GB"):
         latent_cache.fill_latent_cache(cached)
+
+
+def test_processes_may_open_a_new_file_at_once_and_other_paths_are_named(tmp_path):
+    weights = {"one": torch.zeros(3)}
+
+    def opened(number):
+        return LatentCache(tmp_path / str(number // 8) / "latents.sqlite3", weights, 192)
+
+    with ThreadPoolExecutor(8) as pool:
+        assert len(list(pool.map(opened, range(160)))) == 160
+    (tmp_path / "file").touch()
+    with pytest.raises(StorageError, match="make the folder"):
+        LatentCache(tmp_path / "file" / "latents.sqlite3", weights, 192)
+    with pytest.raises(StorageError, match="a file on a local disk") as caught:
+        LatentCache(tmp_path, weights, 192)
+    assert "remove" not in str(caught.value)
+
+
+def test_instructions_are_encoded_before_images_also_for_a_checkpoint(
+    settings, cached, episodes, counted
+):
+    report = train_on(episodes[:2], episodes[2:], settings)
+    counted.clear()
+    episodes[:2] = [replace(one, instruction="stand the box") for one in episodes[:2]]
+    init = {"init": report.checkpoint}
+    without = cached.model_copy(
+        update={**init, "wan": cached.wan.model_copy(update={"folder": None})}
+    )
+    with pytest.raises(InvalidInputError, match=r"stand the box.*--wan\.folder"):
+        latent_cache.fill_latent_cache(without)
+    assert not counted
+    latent_cache.fill_latent_cache(cached.model_copy(update=init))
+    assert (cached.wan.text_cache / f"{key_of('stand the box')}.safetensors").is_file()
 
 
 def test_it_is_for_the_pretrained_autoencoder_and_has_a_place(settings, cached, tiny_model):
