@@ -16,7 +16,7 @@ from dextouch.streams import H264_UNIT, MOUNTS, Sample, StreamDescriptor, Stream
 from services.acquisition.clock import StationClock
 from services.acquisition.drivers.base import Driver, Readings
 from services.acquisition.drivers.images import GroupPreview
-from services.acquisition.health.cells import NO_CELL, glove_record
+from services.acquisition.health.glove_records import glove_record
 from services.acquisition.health.monitor import HealthMonitor
 from services.acquisition.recorder import Recorder
 from services.acquisition.settings import SpoolSafety
@@ -182,9 +182,7 @@ class LiveView:
             sample = self._newest.get(name)
             if sample is None or now_ns - sample.t_host_ns > MAX_AGE_NS:
                 continue
-            cells_kpa = (sample.values.ravel() - glove.tare_counts) / glove.gain_counts_per_kpa
-            taxels = np.where(glove.cells == NO_CELL, 0.0, cells_kpa[glove.cells])
-            pressures[name] = np.maximum(np.nan_to_num(taxels), 0.0).astype(np.float32)
+            pressures[name] = glove.to_kpa(sample.values.reshape(1, -1))[0].astype(np.float32)
         return pressures
 
     def ages_s(self, kinds: Container[StreamKind], now_ns: int) -> dict[str, float | None]:

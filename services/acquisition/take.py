@@ -31,8 +31,9 @@ from dextouch.streams import H264_UNIT, EncodedBatch, Sample, SampleBatch, Strea
 from services.acquisition.clock import HostWatch, PeriodicCall, StationClock
 from services.acquisition.drivers.base import Driver, Readings
 from services.acquisition.health.causes import SIMULATED_ADVICE
-from services.acquisition.health.cells import count_taxels, is_ours
+from services.acquisition.health.cells import count_taxels
 from services.acquisition.health.codes import CODES
+from services.acquisition.health.glove_records import is_ours
 from services.acquisition.health.monitor import HealthMonitor
 from services.acquisition.settings import SpoolSafety
 from services.acquisition.supervisor import StreamCounters

@@ -313,17 +313,12 @@ def _implausible(report: AlignmentReport) -> list[str]:
         if name.endswith("_highest_zero_kpa") and kpa > CONTACT_THRESHOLD_KPA
     ]
     for name, figure in report.quality.items():
-        camera, figures = name.removesuffix("_lag_s"), report.quality
-        if name.endswith("_lag_s") and f"{camera}_lag_sigma_s" in figures:
-            lag = f"{abs(figure) * 1e3:.0f} ± {figures[f'{camera}_lag_sigma_s'] * 1e3:.0f} ms"
-            way = "later" if figure > 0 else "earlier"
-            found.append(f"{camera}: images are {lag} {way} than their times: measure its latency")
+        camera, _, what = name.partition("_looks_")
+        if what:
+            what = what.replace("_", " ")
+            found.append(f"{camera}: looks {what}: compare a picture with its calibration")
         elif name.endswith("_still_share") and figure > STILL_SHARE:
             found.append(f"{name.removesuffix('_still_share')}: images stay as they are")
-        elif "_looks_" in name:
-            camera, _, what = name.partition("_looks_")
-            what = f"like {what}" if what.startswith("camera_") else what.replace("_", " ")
-            found.append(f"{camera}: looks {what}: compare a picture with its calibration")
     if num_steps := report.quality.get("num_steps_interpolated"):
         found.append(f"{num_steps:.0f} of {report.num_steps} steps interpolated across gaps")
     return found

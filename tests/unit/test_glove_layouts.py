@@ -18,7 +18,8 @@ from services.acquisition.devices.justfloat_glove import JustFloatGloveDecoder
 from services.acquisition.devices.kinds import build_drivers, device_kind
 from services.acquisition.devices.tactile_glove import TactileGloveDecoder
 from services.acquisition.devices.wuji_glove import WujiGloveDecoder
-from services.acquisition.health.cells import cell_judge, glove_record, mapped_cells
+from services.acquisition.health.cells import cell_judge
+from services.acquisition.health.glove_records import glove_record, mapped_cells
 from services.acquisition.health.station import needed_matrices
 from services.acquisition.mocks.gloves import (
     GloveCalibration,

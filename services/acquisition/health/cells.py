@@ -1,4 +1,4 @@
-"""Pressure cells of gloves: their calibration record, and the health checks of each cell.
+"""Health checks of the pressure cells of gloves.
 
 A cell that does not change is reported if its neighbours change while it does not, or if no load
 explains its reading (docs/health.md). `TaxelCheck` checks gloves that send counts, whose layout
@@ -8,18 +8,15 @@ wires their taxels, by their tare, `CellCheck` those of other manufacturers.
 import math
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
 from typing import Final
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-from dextouch.errors import InvalidInputError, NotFoundError
+from dextouch.errors import InvalidInputError
 from dextouch.schemas import Matrix, TaxelState
 from dextouch.streams import (
-    TAXEL_UNIT,
-    StreamDescriptor,
     TaxelFaults,
     drifting_taxels,
     implausible_gain,
@@ -31,6 +28,7 @@ from dextouch.tactile.layout import DEXTOUCH_V1, Side, TactileLayout
 from services.acquisition.drivers.base import CellLayout, Decoder
 from services.acquisition.health.codes import CODES
 from services.acquisition.health.evaluation import Evaluation, Finding
+from services.acquisition.health.glove_records import NO_CELL, GloveRecord, mapped_cells
 
 RECENT_NS = 500_000_000
 MIN_RECENT_SPAN_NS = 400_000_000
@@ -55,119 +53,17 @@ TARE_SIGMA_COUNTS = 1.0
 MAX_TOUCHED_SHARE = 0.25
 DRIFT_NS = 10_000_000_000
 MAX_ZEROS = 1200
-PLACES = {
+# Said of taxels that a take would lose, after their number; braces stand for their pads.
+LOST_TAXELS = {
+    "random": "",
+    "copied": "",
     "saturated": " in {}: pressures end at the highest reading",
-    "drifting": " in {}: tare the glove again once it is warm",
 }
+LOST_TAXELS |= {"drifting": " in {}: tare the glove again once it is warm"}
 # Evaluations come once a second; one may be late.
 MAX_STEP_NS = 1_500_000_000
 PINNED_STATES: Final[tuple[TaxelState, ...]] = ("dead", "stuck", "saturated")
 _SCAN_COLUMNS = 20
-# In the calibration's map, of a taxel that no cell measures.
-NO_CELL = -1
-
-
-@dataclass(frozen=True)
-class GloveRecord:
-    """counts = tare + gain · pressure of each cell, and the cell of each of its taxels.
-
-    The sigma of a tare that does not state it is 0.
-    """
-
-    tare_counts: Float64[np.ndarray, " cells"]
-    gain_counts_per_kpa: Float64[np.ndarray, " cells"]
-    tare_sigma_counts: Float64[np.ndarray, " cells"]
-    cells: Int64[np.ndarray, " taxels"]
-
-    def to_kpa(self, readings: np.ndarray, refused: np.ndarray) -> np.ndarray:
-        """Pressures [n, taxels] of readings [n, cells]; 0 of taxels refused or without a cell."""
-        offsets = readings[:, self.cells] - self.tare_counts[self.cells]
-        is_out = refused | (self.cells == NO_CELL)
-        gain = np.where(is_out, np.inf, self.gain_counts_per_kpa[self.cells])
-        return np.asarray(np.maximum(offsets, 0.0) / gain)
-
-
-def is_ours(descriptor: StreamDescriptor) -> bool:
-    """Whether a stream holds counts of a glove whose layout wires its cells: they need no map."""
-    layout = descriptor.tactile_layout
-    return descriptor.unit == "counts" and descriptor.shape == (layout.num_raw_cells,)
-
-
-def mapped_cells(
-    descriptor: StreamDescriptor, calibration: Mapping[str, Matrix]
-) -> Int64[np.ndarray, " taxels"] | None:
-    """For each taxel the number of its cell, -1 for none; None where no map (1 x taxels) is known.
-
-    The map of the calibration comes before that of the stream's layout; a stream that is already in
-    kPa has its taxels in order.
-
-    Raises:
-        NotFoundError: the map is of another size.
-        InvalidInputError: it names a cell that the glove has not.
-    """
-    num_cells, name = math.prod(descriptor.shape), f"{descriptor.name}_cells"
-    if descriptor.layout is not None and descriptor.unit == TAXEL_UNIT:
-        return np.arange(num_cells)
-    if name not in calibration:
-        layout, side = descriptor.layout, descriptor.side
-        return None if layout is None or side is None else layout.raw_indices(side)
-    cells = _row(calibration, name, descriptor.tactile_layout.num_taxels)
-    wrong = (cells != np.rint(cells)) | (cells < NO_CELL) | (cells >= num_cells)
-    if wrong.any():
-        taxel = int(np.argmax(wrong))
-        raise InvalidInputError(
-            f"calibration {name!r}: got {cells[taxel]:g} for taxel {taxel}, expected a whole "
-            f"number -1 … {num_cells - 1}, the cell of the {descriptor.side} glove that measures it"
-        )
-    return cells.astype(np.int64)
-
-
-def glove_record(
-    descriptor: StreamDescriptor, calibration: Mapping[str, Matrix]
-) -> GloveRecord | None:
-    """What makes pressures of a glove's readings; None where the calibration does not say it.
-
-    Raises:
-        NotFoundError: a row of another size, or a glove without a side.
-        InvalidInputError: a map that names a cell that the glove has not.
-    """
-    names = [f"{descriptor.name}_{what}" for what in ("tare_counts", "gain_counts_per_kpa")]
-    if descriptor.kind != "tactile" or names[0] not in calibration:
-        return None
-    if descriptor.layout is not None and descriptor.unit == TAXEL_UNIT:
-        return None
-    layout = descriptor.tactile_layout
-    kpa_per_unit = None if descriptor.layout is None else layout.nominal_kpa_per_unit
-    if names[1] not in calibration and kpa_per_unit is None:
-        return None
-    num_cells = math.prod(descriptor.shape)
-    cells = mapped_cells(descriptor, calibration)
-    if cells is None:
-        if not is_ours(descriptor):
-            return None
-        if descriptor.side is None:
-            raise NotFoundError(f"stream {descriptor.name!r}: a glove without a side")
-        cells = layout.raw_indices(descriptor.side)
-    tare = _row(calibration, names[0], num_cells)
-    if names[1] in calibration or kpa_per_unit is None:
-        gain = _row(calibration, names[1], num_cells)
-    else:
-        gain = np.ones(num_cells)
-        gain[cells[cells != NO_CELL]] = 1.0 / kpa_per_unit[cells != NO_CELL]
-    name = f"{descriptor.name}_tare_sigma_counts"
-    stated = np.size(calibration.get(name, ())) > 0
-    sigma = _row(calibration, name, num_cells) if stated else np.zeros(num_cells)
-    return GloveRecord(tare, gain, sigma, cells)
-
-
-def _row(calibration: Mapping[str, Matrix], name: str, size: int) -> Float64[np.ndarray, " size"]:
-    row = np.array(calibration[name], dtype=np.float64).ravel()
-    if row.shape != (size,):
-        raise NotFoundError(
-            f"calibration {name!r}: got {row.size} numbers, expected {size}; "
-            "calibrate the glove and give the station its record"
-        )
-    return row
 
 
 class _PressureCheck(ABC):
@@ -325,6 +221,8 @@ class TaxelCheck(_PressureCheck):
     def _judge_faults(self, taxels: np.ndarray, evaluation: Evaluation) -> None:
         """What alignment finds in whole takes, in parts of 5 s."""
         now_ns = evaluation.now_ns
+        if not self._usable.any():
+            return
         if self._frozen is not None:
             if (taxels == self._frozen[0]).all():
                 lasted_s = (now_ns - self._frozen[1]) * 1e-9
@@ -351,20 +249,22 @@ class TaxelCheck(_PressureCheck):
         # At full scale they have a code of their own.
         top_kpa = (self._top - self._tare_counts) / self._gain_counts_per_kpa
         faults["saturated"] &= part.highest_kpa() < top_kpa
-        for reason in ("random", "copied", *PLACES):
-            if count := int(faults[reason].sum()):
-                is_error = count >= CODES["taxels_dead"].error * self._layout.num_taxels
-                pads = zip(self._layout.pads, self._layout.starts, strict=True)
-                where = [p.part for p, at in pads if faults[reason][at : at + p.num_taxels].any()]
-                text = f"{count} taxels are {reason}"
-                text += PLACES[reason].format(", ".join(where)) if reason in PLACES else ""
-                judged.findings.append(
-                    Finding("implausible", "ERROR" if is_error else "WARN", text)
-                )
+        judged.findings += self._lost(faults)
         if self._gain_text:
             judged.findings.append(Finding("implausible", "ERROR", self._gain_text))
         self._found, self._faults, self._faults_ns = judged.findings, self._begin(), 0
         self._faults.blocks.follow(part.blocks)
+
+    def _lost(self, faults: Mapping[str, Bool[np.ndarray, " taxels"]]) -> Iterator[Finding]:
+        """What a take would lose for these faults."""
+        pads = list(zip(self._layout.pads, self._layout.starts, strict=True))
+        for reason, more in LOST_TAXELS.items():
+            taxels = faults[reason]
+            if count := int(taxels.sum()):
+                is_error = count >= CODES["taxels_dead"].error * self._layout.num_taxels
+                where = [pad.part for pad, at in pads if taxels[at : at + pad.num_taxels].any()]
+                text = f"{count} taxels are {reason}" + more.format(", ".join(where))
+                yield Finding("implausible", "ERROR" if is_error else "WARN", text)
 
     def _readings(self, values: np.ndarray) -> np.ndarray:
         taxels = values[:, self._indices]
@@ -467,16 +367,6 @@ def cell_judge(decoder: Decoder, calibration: Mapping[str, Matrix]) -> "CellChec
     cells = mapped_cells(descriptor, calibration)
     used = None if cells is None else np.isin(np.arange(num_cells), cells[cells != NO_CELL])
     return CellCheck(layout, used, cells, descriptor.layout)
-
-
-def refused_taxels(
-    descriptor: StreamDescriptor, calibration: Mapping[str, Matrix], record: GloveRecord
-) -> Bool[np.ndarray, " taxels"]:
-    """Taxels whose gain the calibration refused."""
-    states = np.array(calibration.get(f"{descriptor.name}_taxel_state", ())).ravel()
-    if states.shape != record.tare_counts.shape:
-        states = np.zeros(len(record.tare_counts))
-    return (states[record.cells] > 0) & (record.cells != NO_CELL)
 
 
 class CellCheck(_PressureCheck):

@@ -9,13 +9,7 @@ from dextouch.streams import BODIES, StreamDescriptor
 from services.acquisition.clock import PeriodicCall, StationClock
 from services.acquisition.drivers.base import Driver
 from services.acquisition.health.causes import SIMULATED_ADVICE, find_causes
-from services.acquisition.health.cells import (
-    TaxelCheck,
-    cell_judge,
-    glove_record,
-    is_ours,
-    refused_taxels,
-)
+from services.acquisition.health.cells import TaxelCheck, cell_judge
 from services.acquisition.health.clock import ClockCheck, CountingCheck
 from services.acquisition.health.codes import CODES, SEVERITY
 from services.acquisition.health.evaluation import (
@@ -27,6 +21,7 @@ from services.acquisition.health.evaluation import (
     raised_finding,
     worst,
 )
+from services.acquisition.health.glove_records import glove_record, is_ours, refused_taxels
 from services.acquisition.health.history import STATION_FIGURES, HealthHistory, StreamMeter
 from services.acquisition.health.station import (
     CalibrationCheck,

@@ -13,7 +13,6 @@ import numpy as np
 from dextouch.schemas import Matrix
 from dextouch.streams import TAXEL_UNIT, StreamDescriptor
 from services.acquisition.clock import HostWatch, StationClock
-from services.acquisition.health.cells import is_ours
 from services.acquisition.health.evaluation import (
     WINDOW_NS,
     CountWindow,
@@ -21,6 +20,7 @@ from services.acquisition.health.evaluation import (
     Finding,
     Rolling,
 )
+from services.acquisition.health.glove_records import is_ours
 from services.acquisition.supervisor import DeviceSupervisor
 from services.acquisition.watches import PathWatch
 

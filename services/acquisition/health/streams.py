@@ -25,7 +25,6 @@ from dextouch.streams import (
     turned_rad,
 )
 from services.acquisition.drivers.base import Driver
-from services.acquisition.health.cells import glove_record, refused_taxels
 from services.acquisition.health.evaluation import (
     WINDOW_NS,
     Block,
@@ -34,6 +33,7 @@ from services.acquisition.health.evaluation import (
     Finding,
     Rolling,
 )
+from services.acquisition.health.glove_records import glove_record, refused_taxels
 from services.acquisition.supervisor import DeviceSupervisor
 
 GAP_PERIODS = 3

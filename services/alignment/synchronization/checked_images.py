@@ -18,8 +18,8 @@ from dextouch.streams import (
     IMAGE_FAULTS,
     PICTURE_SHAPE,
     TRACKERS,
-    CameraMotion,
     Implausible,
+    MovingCamera,
     View,
     image_faults,
     spread,
@@ -32,7 +32,7 @@ from services.alignment.synchronization.recorded_streams import DatedStream, mov
 # Images of a camera that are looked at, some seconds in the middle of the take: JPEG of VGA takes
 # 0.9 ms each, H.264 0.6 ms, the rest of an alignment of 30 s some 3 s; and stations look at all.
 MAX_LOOKED: Final = 120
-# Poses around them with which lags are looked for.
+# Poses around them with which images that are late are told from turned ones.
 REACH_NS: Final = 500_000_000
 MIN_POSES: Final = 2
 _LEFT_OUT: Final = ("black", "torn")
@@ -77,26 +77,24 @@ def check_views(
     calibration: Mapping[str, Matrix],
 ) -> dict[str, float]:
     """Compare what cameras saw with how they moved; no figure makes a take a bad one."""
-    known = {
-        name: replace(view, K=np.array(calibration[f"K_{name.removeprefix('camera_')}"]))
-        for name, view in views.items()
-        if view is not None and f"K_{name.removeprefix('camera_')}" in calibration
-    }
-    found = {name: _motion(name, view, streams, calibration) for name, view in known.items()}
-    motions = {name: motion for name, motion in found.items() if motion is not None}
     quality: dict[str, float] = {}
-    for name, faults in view_faults({name: known[name] for name in motions}, motions).items():
+    for name, view in views.items():
+        K = calibration.get(f"K_{name.removeprefix('camera_')}")
+        if view is None or K is None:
+            continue
+        motion = _motion(name, view, streams, calibration)
+        if motion is None:
+            continue
+        faults = view_faults(replace(view, K=np.array(K)), motion)
         quality |= {f"{name}_looks_{what}": share for what, share in faults.looks.items()}
         if faults.still_share is not None:
             quality[f"{name}_still_share"] = faults.still_share
-        if faults.lag_s is not None:
-            quality[f"{name}_lag_s"], quality[f"{name}_lag_sigma_s"] = faults.lag_s
     return quality
 
 
 def _motion(
     name: str, view: View, streams: Mapping[str, DatedStream], calibration: Mapping[str, Matrix]
-) -> CameraMotion | None:
+) -> MovingCamera | None:
     """Motion of a camera; None without poses, or where its mount is not known."""
     tracker = TRACKERS.get(name, "")
     T = calibrated_transform(calibration, f"T_tracker_{tracker.removeprefix('wrist_')}_{name}")
@@ -108,4 +106,4 @@ def _motion(
     seen &= (raw.t_ns > view.t_ns[0] - REACH_NS) & (raw.t_ns < view.t_ns[-1] + REACH_NS)
     if np.count_nonzero(seen) < MIN_POSES:
         return None
-    return CameraMotion(raw.t_ns[seen], transform_from_pose(poses[seen]))
+    return MovingCamera(raw.t_ns[seen], transform_from_pose(poses[seen]))

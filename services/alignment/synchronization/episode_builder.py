@@ -151,7 +151,7 @@ def check_bodies(streams: Mapping[str, DatedStream], domain: Domain) -> None:
         )
 
 
-def check_hands(streams: Mapping[str, DatedStream]) -> None:
+def check_hand_traces(streams: Mapping[str, DatedStream]) -> None:
     """Refuse wrists and gloves that do not go with their hands; raises InvalidInputError."""
     traces = HandTraces()
     if not any(name.startswith("keypoints") for name in streams):
@@ -267,20 +267,8 @@ def build_episode(
     streams = _dated_streams(recording, on_progress)
     _check_hands(recording, streams)
     streams = with_tracked_objects(streams, objects, recording.attributes.calibration)
-    looked = {n: looked_at(one) for n, one in streams.items() if one.descriptor.kind == "image"}
-    streams |= {name: stream for name, (stream, _) in looked.items()}
-    checked = {
-        name: checked_stream(stream, max_gap_ns=options.longest_bridge_ns)
-        for name, stream in streams.items()
-    }
+    checked, views = _checked_streams(streams, recording, options)
     streams = {name: one.stream for name, one in checked.items()}
-    check_bodies(streams, recording.attributes.domain)
-    check_hands(streams)
-    views = check_views(
-        {name: view for name, (_, view) in looked.items()},
-        streams,
-        recording.attributes.calibration,
-    )
     span = find_span(recording, checked, options, on_progress)
     on_progress(progress_within("retargeting", 0.0))
     source, gridded = recording.attributes, span.gridded
@@ -326,6 +314,26 @@ def build_episode(
         "object_boxes_m": tuple(one.box_m for one in listed),
     }
     return BuiltEpisode(attributes.model_copy(update=more), tuple(written))
+
+
+def _checked_streams(
+    streams: dict[str, DatedStream], recording: RecordingReader, options: AlignmentOptions
+) -> tuple[dict[str, CheckedStream], dict[str, float]]:
+    """The streams without what cannot be true, and figures of what cameras saw.
+
+    Raises InvalidInputError: streams that do not fit each other.
+    """
+    looked = {n: looked_at(one) for n, one in streams.items() if one.descriptor.kind == "image"}
+    streams = streams | {name: stream for name, (stream, _) in looked.items()}
+    checked = {
+        name: checked_stream(stream, max_gap_ns=options.longest_bridge_ns)
+        for name, stream in streams.items()
+    }
+    streams = {name: one.stream for name, one in checked.items()}
+    check_bodies(streams, recording.attributes.domain)
+    check_hand_traces(streams)
+    views = {name: view for name, (_, view) in looked.items()}
+    return checked, check_views(views, streams, recording.attributes.calibration)
 
 
 def _dated_streams(recording: RecordingReader, on_progress: OnProgress) -> dict[str, DatedStream]:

@@ -16,7 +16,7 @@ from .bodies import implausible_bodies as implausible_bodies
 from .camera_motion import STILL_SHARE as STILL_SHARE
 from .camera_motion import TRACKERS as TRACKERS
 from .camera_motion import TURNED_RAD as TURNED_RAD
-from .camera_motion import CameraMotion as CameraMotion
+from .camera_motion import MovingCamera as MovingCamera
 from .camera_motion import View as View
 from .camera_motion import turned_rad as turned_rad
 from .camera_motion import view_faults as view_faults

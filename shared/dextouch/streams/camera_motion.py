@@ -1,4 +1,4 @@
-"""Compares what a camera's pictures show with how the camera moved: still, turned, late, another's.
+"""Compares what a camera's pictures show with how the camera moved: still, turned or mirrored.
 
 A picture flows (Lucas and Kanade, 1981, in parts of the picture, of which the median is taken) as
 its camera turns, and as it moves past a scene at one depth, which is unknown. Hands that fill half
@@ -6,7 +6,7 @@ of the picture and more may flow otherwise: nothing that is said here makes a ta
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
@@ -34,9 +34,9 @@ TURNS: Final[Mapping[str, tuple[tuple[int, int], tuple[int, int]]]] = {
     "transposed": ((0, 1), (1, 0)),
     "transposed_and_turned_by_180_degrees": ((0, -1), (-1, 0)),
 }
-# Share of the flow that a reading explains if it is right, and if it is wrong. Hands that the head
-# follows explain up to 0.5 of a wrong lag. Readings that explain as much less are as likely.
-RIGHT_SHARE, WRONG_SHARE, MIN_APART = 0.65, 0.1, 0.25
+# Share of the flow that a reading explains if it is right, and more than others that are wrong.
+# Hands that the head follows explain up to 0.5 otherwise.
+RIGHT_SHARE, MIN_APART = 0.65, 0.25
 # Parts of a picture, of 4 by 4 blocks, and the RMS change of levels from block to block along the
 # evener axis that tells how one flows; half of them must.
 PARTS: Final = (5, 7)
@@ -46,14 +46,8 @@ MIN_WEIGHT: Final = 0.2
 # Predicted flow of an image, RMS, below which a camera stands still: 0.5 px of VGA at 500 px.
 MIN_FLOW_RAD: Final = 1e-3
 MIN_VIEW_IMAGES: Final = 60
-# Lags that are tried, and what makes one sure: its share of what is left without it, its sigmas,
-# and its size, as cameras without a calibrated latency are as late as an image takes.
-MAX_LAG_S, LAG_STEP_S = 0.4, 0.01
-MIN_GAIN, LAG_SIGMAS, MIN_LAG_S = 0.25, 4.0, 0.035
-# What moves by itself, such as hands that the head follows, shifts a lag by some of this times the
-# share that it leaves unexplained.
-OWN_MOTION_S: Final = 0.3
-NUM_PARTS: Final = 6
+# What is late may look turned in a motion to and fro: turned is what no lag explains as well.
+MAX_LAG_S, LAG_STEP_S, LATE_APART = 0.4, 0.02, 0.1
 # While a camera turns by so much in a second, or moves past what is a metre away, its picture is
 # off by 30 px of VGA at 500 px, and changes by more than noise does; in so many images at least.
 TURNED_RAD, STILL_NOISE, STILL_SHARE, MIN_TURNED = 0.06, 2.0, 0.9, 15
@@ -97,7 +91,7 @@ class View:
         return np.asarray(blocks * [width / COLUMNS / focal_x, height / ROWS / focal_y])
 
 
-class CameraMotion:
+class MovingCamera:
     """How a camera at poses T_world_camera, two at least, turns and moves, as flow of a picture."""
 
     def __init__(
@@ -151,36 +145,16 @@ class ViewFaults:
 
     Attributes:
         still_share: of the images before which the camera turned, those that are the same.
-        looks: how the images may be turned or mirrored, or the camera with which they may have been
-            exchanged, with the share of the flow that this explains.
-        lag_s: by how much images show what was before their time, with its standard deviation.
+        looks: how the images may be turned or mirrored, with the share of the flow that explains.
     """
 
     still_share: float | None = None
     looks: Mapping[str, float] = field(default_factory=dict)
-    lag_s: tuple[float, float] | None = None
 
 
-def view_faults(
-    views: Mapping[str, View], motions: Mapping[str, CameraMotion]
-) -> dict[str, ViewFaults]:
-    """Compare the pictures of each camera with its motion, and with those of others.
-
-    Cameras are exchanged if each has the pictures of the other.
-    """
-    found = {name: _view_faults(name, view, motions) for name, view in views.items()}
-
-    def agreed(name: str, what: str) -> bool:
-        return what in TURNS or (what in found and name in found[what].looks)
-
-    return {
-        name: replace(one, looks={w: share for w, share in one.looks.items() if agreed(name, w)})
-        for name, one in found.items()
-    }
-
-
-def _view_faults(name: str, view: View, motions: Mapping[str, CameraMotion]) -> ViewFaults:
-    motion, margin_ns = motions[name], round(MAX_LAG_S * 1e9)
+def view_faults(view: View, motion: MovingCamera) -> ViewFaults:
+    """Compare the pictures of a camera with its motion."""
+    margin_ns = round(MAX_LAG_S * 1e9)
     inside = view.t_ns >= motion.t_ns[0] + margin_ns
     inside &= view.t_ns <= motion.t_ns[-1] - margin_ns
     view = View(view.t_ns[inside], view.pictures[inside], view.K, view.size_px)
@@ -193,24 +167,22 @@ def _view_faults(name: str, view: View, motions: Mapping[str, CameraMotion]) -> 
     if np.count_nonzero(known) < MIN_VIEW_IMAGES:
         return ViewFaults(still_share)
     flow, predicted = flow[known], motion.flow(view.t_ns)[known]
-    lags = _Lags(view.t_ns, flow, motion, known)
     shares = {turn: _explained(flow, predicted, turn) for turn in TURNS}
-    others = {n: _explained(flow, one.flow(view.t_ns)[known]) for n, one in motions.items()}
-    turn, like = max(shares, key=shares.__getitem__), max(others, key=others.__getitem__)
-    # What is late may look turned in a motion to and fro.
-    least = max(RIGHT_SHARE, shares[_AS_READ] + MIN_APART, lags.share + WRONG_SHARE)
-    if others[like] > max(least, shares[turn]):
-        return ViewFaults(still_share, {like: others[like]})
+    turn = max(shares, key=shares.__getitem__)
+    if shares[turn] < max(RIGHT_SHARE, shares[_AS_READ] + MIN_APART):
+        return ViewFaults(still_share)
+    lags_ns = np.rint(1e9 * np.arange(-MAX_LAG_S, MAX_LAG_S + LAG_STEP_S, LAG_STEP_S)).astype(int)
+    late = max(_explained(flow, motion.flow(view.t_ns - lag)[known]) for lag in lags_ns)
     halves = np.array_split(np.arange(len(flow)), 2)
-    if shares[turn] > least and all(
-        _explained(flow[p], predicted[p], turn) > _explained(flow[p], predicted[p]) for p in halves
+    if shares[turn] < late + LATE_APART or any(
+        _explained(flow[p], predicted[p], turn) <= _explained(flow[p], predicted[p]) for p in halves
     ):
-        near = {one: share for one, share in shares.items() if share > shares[turn] - MIN_APART}
-        return ViewFaults(still_share, near)
-    return ViewFaults(still_share, lag_s=lags.sure(shares[_AS_READ]))
+        return ViewFaults(still_share)
+    near = {one: share for one, share in shares.items() if share > shares[turn] - MIN_APART}
+    return ViewFaults(still_share, near)
 
 
-def _still_share(view: View, motion: CameraMotion) -> float | None:
+def _still_share(view: View, motion: MovingCamera) -> float | None:
     step_ns = float(np.median(np.diff(view.t_ns)))
     later = max(1, round(1e9 / step_ns))
     turned = motion.turned_rad(view.t_ns[:-later], round(later * step_ns)) > TURNED_RAD
@@ -218,36 +190,3 @@ def _still_share(view: View, motion: CameraMotion) -> float | None:
         return None
     changed = apart(view.pictures[later:], view.pictures[:-later])[turned]
     return float((changed < STILL_NOISE * noise_levels(view.pictures)).mean())
-
-
-class _Lags:
-    """The lag at which a camera's motion explains most of a flow, and how much that is."""
-
-    def __init__(
-        self, t_ns: np.ndarray, flow: np.ndarray, motion: CameraMotion, known: np.ndarray
-    ) -> None:
-        self._flow = flow
-        self._lags_s = np.arange(-MAX_LAG_S, MAX_LAG_S + LAG_STEP_S / 2, LAG_STEP_S)
-        self._predicted = [motion.flow(t_ns - round(lag * 1e9))[known] for lag in self._lags_s]
-        self.lag_s, self.share = self._best(np.arange(len(flow)))
-
-    def _best(self, rows: np.ndarray) -> tuple[float, float]:
-        shares = np.array([_explained(self._flow[rows], one[rows]) for one in self._predicted])
-        top = int(shares[1:-1].argmax()) + 1
-        before, at, after = shares[top - 1 : top + 2].tolist()
-        offset = 0.5 * (before - after) / min(before - 2 * at + after, -1e-12)
-        return float(self._lags_s[top] + np.clip(offset, -0.5, 0.5) * LAG_STEP_S), at
-
-    def sure(self, without: float) -> tuple[float, float] | None:
-        """The lag and its sigma if it explains much of what is left `without` one."""
-        if not MIN_LAG_S < abs(self.lag_s) < MAX_LAG_S - 2 * LAG_STEP_S:
-            return None
-        if self.share < RIGHT_SHARE or self.share - without < MIN_GAIN * (1 - without):
-            return None
-        # The jackknife; a grid is no more exact than a tenth of its step.
-        rows = np.arange(len(self._flow))
-        parts = np.array_split(rows, NUM_PARTS)
-        left_out = [self._best(np.setdiff1d(rows, part))[0] for part in parts]
-        scatter_s = float(np.sqrt((NUM_PARTS - 1) * np.var(left_out)))
-        sigma_s = max(LAG_STEP_S / 10, float(np.hypot(scatter_s, OWN_MOTION_S * (1 - self.share))))
-        return (self.lag_s, sigma_s) if abs(self.lag_s) > LAG_SIGMAS * sigma_s else None

@@ -104,8 +104,8 @@ class TaxelFaults:
         self._turns, self._dips, self._asked, self._silent = zeros[6:]
 
     def add(self, counts: Float64[np.ndarray, "time taxels"]) -> None:
-        """The next readings."""
-        if not len(counts):
+        """The next readings; nothing is judged of a glove without a usable taxel."""
+        if not len(counts) or not self._usable.any():
             return
         offsets = counts - self._tare
         steps = np.diff(counts, axis=0, prepend=self._last[None])
@@ -201,11 +201,12 @@ class TaxelFaults:
         if dithered.any():
             text = f"readings stay within a count of the same in {dithered.sum()} samples"
             return [Implausible("frozen", text, dithered, harmless=not self.blocks.num_moved)]
-        keys = np.concatenate(self._keys) if self._keys else np.zeros(0, dtype=np.uint64)
+        if n < MIN_SAMPLES_TO_JUDGE:
+            return []
+        keys = np.concatenate(self._keys)
         is_new = np.append(True, keys[1:] != keys[:-1])
         turns = self._turns[self._usable]
-        is_noisy = (turns > MIN_NOISE_SHARE * is_new.sum()).mean() > NOISY_TAXELS
-        if n < MIN_SAMPLES_TO_JUDGE or not is_noisy:
+        if (turns > MIN_NOISE_SHARE * is_new.sum()).mean() <= NOISY_TAXELS:
             return []
         halves = np.stack([keys >> np.uint64(32), keys & np.uint64(2**32 - 1)], axis=1)
         rows = halves.astype(np.float64)

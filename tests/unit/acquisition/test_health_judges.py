@@ -9,7 +9,8 @@ from services.acquisition.clock import VirtualClock
 from services.acquisition.devices.pose_tracker import PoseTrackerDecoder, pose_descriptor
 from services.acquisition.drivers.base import Driver
 from services.acquisition.drivers.images import ImageQuality
-from services.acquisition.health.cells import GloveRecord, TaxelCheck, count_taxels, neighbour_share
+from services.acquisition.health.cells import TaxelCheck, count_taxels, neighbour_share
+from services.acquisition.health.glove_records import GloveRecord
 from services.acquisition.health.streams import (
     BodiesCheck,
     CameraCheck,

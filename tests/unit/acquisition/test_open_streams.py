@@ -17,7 +17,7 @@ from services.acquisition.devices import (
 from services.acquisition.devices.pose_tracker import MAGIC, PAYLOAD, PoseTrackerDecoder
 from services.acquisition.drivers.base import DATA_REPORT, split_into_reports
 from services.acquisition.drivers.packets import SOURCES, VERSION, Packet, encode_packet
-from services.acquisition.health.cells import is_ours
+from services.acquisition.health.glove_records import is_ours
 from services.acquisition.settings import AcquisitionSettings
 from services.acquisition.station import LiveView
 from services.acquisition.transports import SerialTransport

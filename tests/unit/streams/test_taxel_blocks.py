@@ -1,5 +1,7 @@
 """Faults of a whole glove, of a pad or of a row, made on the readings of mock gloves."""
 
+import warnings
+
 import numpy as np
 import pytest
 
@@ -7,7 +9,8 @@ from dextouch.errors import InvalidInputError
 from dextouch.schemas import matrix_rows
 from dextouch.streams import TaxelFaults, drifting_taxels, implausible_gain
 from dextouch.tactile.layout import DEXTOUCH_V1
-from services.acquisition.health.cells import GloveRecord, TaxelCheck
+from services.acquisition.health.cells import TaxelCheck
+from services.acquisition.health.glove_records import GloveRecord
 from services.acquisition.mocks.gloves import GloveCalibration
 from services.acquisition.mocks.pattern import pattern_streams
 from services.alignment.calibration.tactile_tare import (
@@ -228,3 +231,14 @@ def test_taxels_that_say_nothing_are_no_fault():
     faults = TaxelFaults(np.full(320, 120.0), np.full(320, 40.0))
     faults.add(np.full((40, 320), np.nan))
     assert not any(faults.faults()[name].any() for name in ("saturated", "drifting"))
+
+
+def test_a_glove_without_a_usable_taxel_is_not_judged():
+    count = DEXTOUCH_V1.num_taxels
+    none = np.zeros(count, dtype=bool)
+    faults = TaxelFaults(np.zeros(count), np.full(count, 10.0), usable=none)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        faults.add(np.ones((400, count)))
+        assert faults.num_samples == 0
+        assert faults.repeats() == []
