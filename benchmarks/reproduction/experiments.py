@@ -100,7 +100,8 @@ class Sizes(FrozenModel):
     are human episodes as multiples of the robot episodes, `pretraining_per_task` robot episodes
     with mistakes for the model that is adapted. `adapt_robot_per_task` are the robot episodes of
     WM-Robot, `adapt_half_per_task` the robot ones and the human ones of WM-Mix, 200 and 100 as in
-    the paper; `downstream_per_task` are the scenes of which two thirds have to suffice for them.
+    the paper; `adapt_members` are the members of these models; `downstream_per_task` are the scenes
+    of which two thirds have to suffice for them.
     """
 
     robot_per_task: int = Field(default=4, ge=2)
@@ -119,6 +120,7 @@ class Sizes(FrozenModel):
     pretraining_core_steps: int = Field(default=1500, ge=2)
     adapt_reader_steps: int = Field(default=2000, ge=1)
     adapt_core_steps: int = Field(default=1500, ge=1)
+    adapt_members: int = Field(default=1, ge=1)
     core_batch: int = Field(default=32, ge=1)
     drawing_cpu_s: int = Field(default=30, ge=1)
     policy_steps: int = Field(default=3000, ge=1)
@@ -265,9 +267,9 @@ class Experiments:
         steps: tuple[int, int],
         robot: str = "robot",
         num_human: int = 0,
-        flags: str = "",
+        flags: str = "--num-members 1",
     ) -> Step:
-        """A state model of one member, with numbers of steps of its start reader and its core."""
+        """A state model, with numbers of steps of its start reader and its core."""
         needs = [self._data[robot], self._data["robot-heldout"]]
         if num_human:
             needs.append(self._data["human"])
@@ -275,7 +277,7 @@ class Experiments:
         return step_with_result(
             name,
             f"train world-model --episodes data/{robot}/store --heldout data/robot-heldout/store "
-            f"{flags} --seed {seed} --num-members 1 --jobs 1 "
+            f"{flags} --seed {seed} --jobs 1 "
             f"--reader.num-steps {steps[0]} "
             f"--core.num-steps {steps[1]} --core.batch {self.sizes.core_batch} "
             f"--drawing.cpu-budget-s {self.sizes.drawing_cpu_s} --output {name}/{_MODEL}",
@@ -336,7 +338,7 @@ class Experiments:
             steps=(sizes.pretraining_reader_steps, sizes.pretraining_core_steps),
             robot="pretraining",
             num_human=self._num_human(max(sizes.multiples)),
-            flags="--human-share 0.2",
+            flags=f"--num-members {sizes.adapt_members} --human-share 0.2",
         )
         num_robot = len(DOWNSTREAM) * sizes.adapt_robot_per_task
         num_half = len(DOWNSTREAM) * sizes.adapt_half_per_task
@@ -354,7 +356,7 @@ class Experiments:
             f"--core.num-steps {sizes.adapt_core_steps} --core.batch {sizes.core_batch} "
             f"--drawing.cpu-budget-s {sizes.drawing_cpu_s} --output {name}/{_MODEL}",
             _MODEL,
-            needs=(*(s for n, s in self._data.items() if n.startswith("downstream")), ancestor),
+            needs=(ancestor, *(s for n, s in self._data.items() if n.startswith("downstream"))),
         )
 
     def _judge(self, world: str, seed: int) -> Step:
