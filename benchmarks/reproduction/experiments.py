@@ -347,6 +347,9 @@ class Experiments:
             "WM-Mix": f"--robot-episodes {num_half} --human-episodes {num_half} "
             "--human data/downstream-human/store",
         }
+        stores = ["downstream", "downstream-heldout"]
+        if world == "WM-Mix":
+            stores.append("downstream-human")
         name = f"evaluator/{world}/seed-{seed}/model"
         return step_with_result(
             name,
@@ -356,7 +359,7 @@ class Experiments:
             f"--core.num-steps {sizes.adapt_core_steps} --core.batch {sizes.core_batch} "
             f"--drawing.cpu-budget-s {sizes.drawing_cpu_s} --output {name}/{_MODEL}",
             _MODEL,
-            needs=(ancestor, *(s for n, s in self._data.items() if n.startswith("downstream"))),
+            needs=(ancestor, *(self._data[name] for name in stores)),
         )
 
     def _judge(self, world: str, seed: int) -> Step:
