@@ -338,7 +338,7 @@ class Experiments:
             steps=(sizes.pretraining_reader_steps, sizes.pretraining_core_steps),
             robot="pretraining",
             num_human=self._num_human(max(sizes.multiples)),
-            flags=f"--num-members {sizes.adapt_members} --human-share 0.2",
+            flags="--num-members 1 --human-share 0.2",
         )
         num_robot = len(DOWNSTREAM) * sizes.adapt_robot_per_task
         num_half = len(DOWNSTREAM) * sizes.adapt_half_per_task
@@ -355,7 +355,8 @@ class Experiments:
             name,
             f"train adapt --init {ancestor.name}/{_MODEL} --episodes data/downstream/store "
             f"--splits B,C {flags[world]} --heldout data/downstream-heldout/store --seed {seed} "
-            f"--jobs 1 --reader.num-steps {sizes.adapt_reader_steps} "
+            f"--num-members {sizes.adapt_members} --jobs 1 "
+            f"--reader.num-steps {sizes.adapt_reader_steps} "
             f"--core.num-steps {sizes.adapt_core_steps} --core.batch {sizes.core_batch} "
             f"--drawing.cpu-budget-s {sizes.drawing_cpu_s} --output {name}/{_MODEL}",
             _MODEL,
