@@ -15,12 +15,14 @@ from benchmarks.simulated.board_scenes import mount_difference
 from dextouch.clients import HttpLink
 from dextouch.errors import (
     InvalidInputError,
+    NotFoundError,
     StaleDataError,
     UnknownNameError,
 )
 from dextouch.geometry import invert, transform
 from dextouch.geometry.rotations import rotation_from_vector
-from services.alignment.station_calibration import boards
+from dextouch.streams import pack
+from services.alignment.station_calibration import boards, mount
 from services.alignment.station_calibration import camera_views as camera
 from services.pipelines.calibrate import main
 from tests.unit.cli.rendered_boards import (
@@ -192,6 +194,31 @@ def test_station_images_come_once_each_and_pauses_are_no_images():
     link.request.side_effect = replies
     arrivals = camera.station_arrivals(link, "head", wait=lambda _: None)
     assert [next(arrivals)[1], next(arrivals)[1]] == [b"a", b"b"]
+
+
+@pytest.mark.parametrize("of_mount", [False, True])
+def test_a_run_waits_half_a_minute_for_the_first_image_of_a_camera(of_mount):
+    no_pose = SimpleNamespace(body=pack({}, {}))
+    waited_s, num_late = [], 20
+
+    def request(method, path, **options):
+        if path.startswith("/v1/live/poses"):
+            return no_pose
+        if len(waited_s) < num_late:
+            raise NotFoundError("camera 'camera_head': not there, or no image yet")
+        return SimpleNamespace(body=b"a")
+
+    link = create_autospec(HttpLink, instance=True)
+    link.request.side_effect = request
+    newest = mount.station_sightings if of_mount else camera.station_arrivals
+    first = next(newest(link, "head", wait=waited_s.append))
+    assert (first.image if of_mount else first[1]) == b"a"
+    assert len(waited_s) == num_late
+    num_late = 10_000
+    waited_s.clear()
+    with pytest.raises(NotFoundError, match="no image yet"):
+        next(newest(link, "head", wait=waited_s.append))
+    assert sum(waited_s) == pytest.approx(30.0)
 
 
 @pytest.mark.parametrize(
