@@ -29,7 +29,7 @@ from dextouch.streams import (
     implausible_values,
     lasting_jumps,
 )
-from dextouch.tactile.layout import TactileLayout, common_layout
+from dextouch.tactile.layout import SIDES, TactileLayout, common_layout
 from services.alignment.settings import AlignmentOptions
 from services.alignment.synchronization import OnProgress, progress_within
 from services.alignment.synchronization.checked_images import check_views, looked_at
@@ -159,11 +159,11 @@ def check_hand_traces(streams: Mapping[str, DatedStream]) -> None:
     traces = HandTraces()
     if not any(name.startswith("keypoints") for name in streams):
         return
-    for name, stream in streams.items():
-        if name.startswith(("keypoints", "tactile")) or name in BODIES[1:]:
-            about = stream.descriptor
+    for name in (f"{kind}_{side}" for kind in ("keypoints", "tactile", "wrist") for side in SIDES):
+        if name in streams:
+            about = streams[name].descriptor
             layout = about.tactile_layout if about.kind == "tactile" else None
-            for piece in stream.pieces():
+            for piece in streams[name].pieces():
                 traces.add(name, piece.t_ns, piece.values, layout)
     for name, (cause, message) in traces.found().items():
         text = f"stream {name!r}: {message}, and record again"

@@ -91,7 +91,9 @@ def implausible_values(
         found = list(implausible_repeats(values, what="keypoints", may_lock=True))
         if values.shape[1:] == (NUM_KEYPOINTS, 3):
             found += _frozen_nodes(values, found)
-    elif descriptor.kind == "robot_state" and descriptor.unit == "rad":
+    elif descriptor.kind == "robot_state" and (
+        descriptor.unit == "rad" or descriptor.name.startswith("joints_")
+    ):
         lower_rad, upper_rad = _limits_rad()
         if values.shape[1:] != lower_rad.shape:
             return []
