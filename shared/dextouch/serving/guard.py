@@ -58,6 +58,11 @@ Admits = Callable[[HTTPConnection], bool]
 Refuse = Callable[[Request, DexTouchError | HTTPException], Response]
 
 
+def close_reason(message: str) -> str:
+    """As much of a message as the close frame of a WebSocket holds (RFC 6455, section 5.5)."""
+    return message.encode()[:MAX_REASON_BYTES].decode(errors="ignore")
+
+
 def header(scope: Scope, name: bytes) -> str | None:
     """First header of a lower-case name, as `starlette.datastructures.Headers.get`, but quicker."""
     found = scope.get(FIRST_HEADERS)
@@ -309,7 +314,7 @@ class GuardMiddleware:
             waits = {"retry-after": str(error.details["retry_after_s"])}
             await PlainTextResponse(error.message, status, waits)(scope, receive, send)
             return
-        reason = error.message.encode()[:MAX_REASON_BYTES].decode(errors="ignore")
+        reason = close_reason(error.message)
         await send({"type": "websocket.close", "code": POLICY_VIOLATION, "reason": reason})
 
     def _check_sender(self, scope: Scope, *, needs_key: bool, is_unsafe: bool) -> None:

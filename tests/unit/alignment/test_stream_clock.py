@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from dextouch.errors import InvalidInputError
 from dextouch.schemas import ClockReport
 from dextouch.streams import ClockCapabilities, SampleBatch, StreamDescriptor
 from services.alignment.command_line import report_line, report_page
@@ -150,3 +151,22 @@ def test_reports_of_older_episodes_load():
     report = ClockReport.model_validate({"stream": "x", "skew_ppm": 1.0, "num_samples": 3})
     assert (report.method, report.latency_sigma_ms) == (None, None)
     assert (report.num_steps, report.warnings) == (0, ())
+
+
+@pytest.mark.parametrize(("stamps", "numbers"), [(True, True), (True, False), (False, True)])
+@pytest.mark.parametrize("count", [2, 9])
+def test_a_stream_of_few_samples_is_dated_by_their_arrival(stamps, numbers, count):
+    """Such as a thermometer with a sample every few seconds: too few for a line."""
+    whole, descriptor = take(stamps=stamps, numbers=numbers)
+    batch = SampleBatch(*(column[:count] for column in vars(whole).values()))
+    timed = time_stream(batch, descriptor, latency_ns=1000)
+    assert timed.report.method == "arrival"
+    np.testing.assert_array_equal(timed.t_host_ns, batch.t_host_ns - 1000)
+
+
+def test_a_counter_beyond_its_bits_is_refused_with_the_name_of_its_stream():
+    batch, descriptor = take(stamps=True, numbers=True)
+    narrow = ClockCapabilities(device_time=True, sequence=True, device_time_bits=24)
+    descriptor = descriptor.model_copy(update={"capabilities": narrow})
+    with pytest.raises(InvalidInputError, match=r"stream 'x': counter: got counts 0 … 2990000000"):
+        time_stream(batch, descriptor)
