@@ -1,5 +1,6 @@
 """Edited items against the arrays that their sources were written from."""
 
+import shlex
 from datetime import UTC, datetime
 
 import numpy as np
@@ -389,6 +390,29 @@ def test_a_relabel_to_another_operator_is_another_one(store, tmp_path):
     maintenance.delete_for_good(store.root, request, tmp_path / "receipt.json")
     with pytest.raises(InvalidInputError, match="permanently deleted"):
         relabel_item(store, "take", {"operator": "p-4"}, kind="recording")
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"operator": ""}, "operator: .* at least 1"),
+        ({"operator": "p" * 129}, "operator: .* at most 128"),
+        ({"instruction": "x" * 9000}, "instruction: .* at most 2000"),
+    ],
+)
+def test_labels_have_the_limits_of_requests(store, changes, message):
+    write_recording(store, "take", operator="p-1")
+    with pytest.raises(InvalidInputError, match=message):
+        relabel_item(store, "take", changes, kind="recording")
+    assert store.list(kind="recording") == ["take"]
+
+
+def test_the_longest_labels_fit_into_the_lineage(store):
+    write_recording(store, "take")
+    changes = {"task": "'" * 128, "instruction": "'" * 2000}
+    result = relabel_item(store, "take", changes, kind="recording", outcome="unknown")
+    (source,) = store.recording(result.id).attributes.lineage
+    assert shlex.split(source.operation)[2::2] == [*changes.values(), "unknown"]
 
 
 def test_an_edit_takes_only_the_files_of_arrays(store):
