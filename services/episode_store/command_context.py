@@ -76,7 +76,7 @@ class Context:
 
 
 def existing_store(url: str) -> EpisodeStore:
-    """The store at a URL; raises NotFoundError without its folder, as of one that is not mounted."""
+    """The store at a URL; raises NotFoundError without its folder, as where none is mounted."""
     store = EpisodeStore(url)
     if store.folders and not store.root.is_dir():
         raise NotFoundError(f"store {store.root}: no such folder; mount it, or name another one")
