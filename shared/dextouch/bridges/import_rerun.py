@@ -117,7 +117,7 @@ def import_rrd(
 
 
 def _chunks(path: Path) -> Iterator[Chunk]:
-    reader, first = _opened(path)[0], None
+    reader, first = opened_rrd(path)[0], None
     try:
         first = next(iter(reader.recordings()), None)
         yield from reader.stream(store=first)
@@ -125,7 +125,7 @@ def _chunks(path: Path) -> Iterator[Chunk]:
         raise CorruptDataError(f"{path}: rerun-sdk cannot read it ({error})") from error
 
 
-def _opened(path: Path) -> tuple[RrdReader, list[str]]:
+def opened_rrd(path: Path) -> tuple[RrdReader, list[str]]:
     """The reader of a file, and its warnings: of a file without a footer, which may be cut."""
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
@@ -185,7 +185,7 @@ class _Rows:
 
     def _note_file(self) -> None:
         if self._survey is not None:
-            reader, said = _opened(self._path)
+            reader, said = opened_rrd(self._path)
             for reason in said:
                 self._survey.refuse(self._path.name, "file", reason)
             names = [one.recording_id[:256] for one in reader.recordings()]

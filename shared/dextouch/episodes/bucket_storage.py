@@ -290,6 +290,7 @@ class ObjectStorage:
 
     def delete(self, kind: Kind, item_id: str) -> None:
         """Delete a group: its commit record first, then its other objects."""
+        self.group(kind, item_id)
         group = group_key(kind, item_id)
         self._bucket.put(f"{group}/{CLAIM_FILE}", _DELETING)
         self._bucket.remove([f"{group}/{COMMIT_FILE}"])

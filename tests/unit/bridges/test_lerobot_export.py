@@ -246,6 +246,18 @@ def _odd(store):
     return [made.write(store)]
 
 
+def _gray(store):
+    made = make_episode()
+    made.values["camera_wrist_left"] = made.values["camera_wrist_left"][..., 0]
+    made.descriptors = [
+        d.model_copy(update={"shape": (48, 64), "unit": "mono8"})
+        if d.name == "camera_wrist_left"
+        else d
+        for d in made.descriptors
+    ]
+    return [made.write(store)]
+
+
 def _mixed(store):
     return [make_episode().write(store), make_episode(seed=4, commanded=False).write(store)]
 
@@ -259,6 +271,7 @@ def _mixed(store):
         (_without_camera, {}, InvalidInputError, "camera_wrist_left"),
         (_without_actions, {}, InvalidInputError, "'action'"),
         (_odd, {}, ShapeError, "47"),
+        (_gray, {}, ShapeError, r"'camera_wrist_left': got uint8 \[48, 64\]"),
         (_mixed, {}, InvalidInputError, "commanded"),
         (two, {"cameras": ("camera_top",)}, InvalidInputError, "camera_top"),
         (two, {"fps": 0}, InvalidInputError, "fps"),
@@ -279,7 +292,8 @@ def test_rates_that_are_no_whole_numbers_are_refused(store, folder):
 def test_an_existing_folder_and_a_strange_name_are_refused(store, folder):
     readers = two(store)
     folder.mkdir(parents=True)
-    with pytest.raises(ConflictError, match="exists"):
+    # No advice that would be refused, too.
+    with pytest.raises(ConflictError, match="is no LeRobot data set; choose another folder"):
         export_dataset(readers, folder, repo_id="touch")
     for name in ("", "a/b/c", "../x", "a b"):
         with pytest.raises(InvalidInputError, match="repo_id"):

@@ -1,5 +1,7 @@
 """Rerun: every sample of a file is what the store holds, as Rerun's own reader gives it back."""
 
+import resource
+
 import numpy as np
 import pytest
 
@@ -10,7 +12,7 @@ from dextouch.bridges.import_recording import ImportAttributes  # noqa: E402
 from dextouch.bridges.import_rerun import import_rrd  # noqa: E402
 from dextouch.bridges.rerun import entity_of, export_rrd  # noqa: E402
 from dextouch.episodes import EpisodeStore  # noqa: E402
-from dextouch.errors import ConflictError, InvalidInputError  # noqa: E402
+from dextouch.errors import ConflictError, InvalidInputError, StorageError  # noqa: E402
 from dextouch.geometry import transform_from_pose  # noqa: E402
 from tests.unit.bridges.takes import (  # noqa: E402
     DISTORTION,
@@ -151,6 +153,21 @@ def test_existing_files_are_kept_unless_told_otherwise(store, tmp_path):
     export_rrd(reader, path, overwrite=True)
     assert [e.recording_id for e in rr.chunk.RrdReader(path).recordings()] == ["stand-bottle-0003"]
     assert len(rr.chunk.RrdReader(path).blueprints()) == 1
+
+
+@pytest.mark.parametrize("missing", [100, 6_000, 200_000])
+def test_a_full_disk_leaves_no_file(missing, store, tmp_path):
+    reader = write_episode(store, num_steps=9)
+    export_rrd(reader, tmp_path / "whole.rrd")
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    least = (tmp_path / "whole.rrd").stat().st_size - missing
+    resource.setrlimit(resource.RLIMIT_FSIZE, (least, limits[1]))
+    try:
+        with pytest.raises(StorageError, match=r"take.rrd: .*free space and try again"):
+            export_rrd(reader, tmp_path / "take.rrd")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["store", "whole.rrd"]
 
 
 @pytest.mark.parametrize(("dtype", "unit"), [("uint8", "mono8"), ("uint16", "mm")])

@@ -96,12 +96,14 @@ def export_dataset(
         ConflictError: the folder exists, is no dataset, or was changed meanwhile.
         InvalidInputError: no episodes, a rate that is not an integer, or episodes that cannot share
             one dataset, such as with a camera that one of them lacks.
-        ShapeError: images with an odd side.
+        ShapeError: images with an odd side, or without colours.
         CorruptDataError, StorageError: a damaged episode or dataset; the write failed.
     """
     if not REPO_ID.fullmatch(repo_id):
         raise InvalidInputError(f"repo_id: got {repo_id!r}, expected a name like 'user/name'")
     check_license(options.license_name)
+    # A link stays one, and what it names is exchanged where it lies.
+    folder = folder.resolve()
     before = _existing(folder, options)
     partial = folder.with_name(f".{folder.name}.{uuid.uuid4().hex}.partial")
     dataset: _Dataset | None = None
@@ -135,13 +137,14 @@ def _existing(folder: Path, options: ExportOptions) -> ExistingDataset | None:
     """The dataset to append to; raises ConflictError where the folder must not be changed."""
     if not folder.exists():
         return None
+    if not (folder / layout.INFO_FILE).is_file():
+        raise ConflictError(
+            f"{folder}: exists and is no LeRobot data set; choose another folder (--force and "
+            "--append leave it as it is)"
+        )
     if options.existing == "refuse":
         raise ConflictError(
             f"{folder}: exists already; choose another folder, or add --append or --force"
-        )
-    if not (folder / layout.INFO_FILE).is_file():
-        raise ConflictError(
-            f"{folder}: is not a LeRobot data set, so --force and --append leave it as it is"
         )
     return ExistingDataset.read(folder) if options.existing == "append" else None
 
@@ -458,7 +461,13 @@ def _check_cameras(reader: EpisodeReader, cameras: tuple[str, ...]) -> None:
             "choose cameras that all episodes have"
         )
     for name in cameras:
-        height_px, width_px = reader.streams[name].shape[:2]
+        dtype, shape = reader.streams[name].dtype, reader.streams[name].shape
+        if dtype != "uint8" or shape[2:] != (3,):
+            raise ShapeError(
+                f"camera {name!r}: got {dtype} {[*shape]}, expected uint8 [h, w, 3] of colours; "
+                "leave it out (`ExportOptions.cameras`), or export the episode as MCAP"
+            )
+        height_px, width_px = shape[:2]
         if height_px % 2 or width_px % 2:
             raise ShapeError(
                 f"camera {name!r}: got images of {height_px} x {width_px} pixels, expected even "
