@@ -42,6 +42,7 @@ from services.acquisition.retention import (
     DeletedTakes,
     SpoolRetention,
     acknowledgement,
+    empty_removed,
     remove_take,
     spooled_takes,
     upload_state,
@@ -352,9 +353,14 @@ def recover_spool(spool_root: Path) -> list[str]:
 
     Every acknowledged sample is kept and the recording's ledger says `interrupted`, and what was
     cut off the log. A take that never had a sample is removed; one that another process is writing
-    is left alone, and so is a damaged one, with the reason in its folder.
+    is left alone, and so is a damaged one, with the reason in its folder. Removals that were
+    interrupted are completed.
     """
     recovered = []
+    try:
+        empty_removed(spool_root)
+    except StorageError as error:
+        logger.warning("fail_retention", error=error.message)
     for path in spooled_takes(spool_root):
         try:
             if not SpoolReader(path).closed and _recover(path):

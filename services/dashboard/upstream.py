@@ -12,6 +12,7 @@ import httpx
 from prometheus_client import Histogram
 from pydantic import SecretStr, TypeAdapter, ValidationError
 
+from dextouch.clients.http_link import service_address
 from dextouch.errors import InvalidInputError, NotFoundError, UnavailableError
 from dextouch.schemas import Problem, error_from_problem, first_problems
 from dextouch.tracing import trace_headers
@@ -49,7 +50,12 @@ class Upstream:
 
     @staticmethod
     def connect(name: str, url: str, *, key: SecretStr | None, timeout_s: float) -> "Upstream":
-        """Create a client with a bounded connection pool, without sending a request."""
+        """Create a client with a bounded connection pool, without sending a request.
+
+        Raises:
+            InvalidInputError: a URL that is none.
+        """
+        service_address(url, what=name)
         headers = {"authorization": f"Bearer {key.get_secret_value()}"} if key else {}
         limits = httpx.Limits(max_connections=8, max_keepalive_connections=4)
         client = httpx.AsyncClient(

@@ -379,6 +379,16 @@ def test_batches_of_large_images_are_small():
     assert batch_samples(STREAMS[0]) == 120
 
 
+def test_a_note_that_cannot_be_read_does_not_end_the_uploads(tmp_path):
+    # As on a bad sector, or of another user.
+    (spool(tmp_path, "a") / UPLOADED_FILE).mkdir()
+    spool(tmp_path, "b")
+    uploader = Uploader(tmp_path, FakeStore(), period_s=1.0)
+    assert uploader.upload_all() == ["b"]
+    assert "note the upload of 'a'" in uploader.status()[0].error
+    assert uploader.counts() == {"waiting": 1, "uploaded": 1, "refused": 0}
+
+
 def test_a_damaged_take_does_not_keep_the_others(tmp_path):
     damaged = spool(tmp_path, "damaged", close=False)
     (damaged / "recording.json").write_text("{")

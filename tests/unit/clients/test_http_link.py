@@ -5,13 +5,32 @@ from http.server import BaseHTTPRequestHandler, HTTPServer
 
 import pytest
 
-from dextouch.clients import HttpLink
-from dextouch.errors import ConflictError, UnavailableError
+from dextouch.clients import EpisodeStoreClient, HttpLink, RolloutClient
+from dextouch.errors import ConflictError, InvalidInputError, UnavailableError
 
 PROBLEM = (
     b'{"type": "urn:dextouch:error:UnavailableError", "title": "t", "status": 503, "detail": "d"}'
 )
 OURS = {"Content-Type": "application/problem+json"}
+
+
+@pytest.mark.parametrize("client", [HttpLink, RolloutClient, EpisodeStoreClient])
+@pytest.mark.parametrize(
+    "url",
+    [
+        "http://h:abc",
+        "http://h:99999",
+        "http://[::1",
+        "h:80",
+        "ftp://h",
+        "http://",
+        "",
+        "http://h:0",
+    ],
+)
+def test_an_address_that_cannot_be_one_is_refused(client, url):
+    with pytest.raises(InvalidInputError, match=r"expected http\(s\)://HOST:PORT"):
+        client(url)
 
 
 @pytest.fixture
