@@ -55,6 +55,8 @@ logger = structlog.get_logger(__name__)
 DAMAGED_FILE = "damaged.txt"
 # A refusal may be a passing one (an upload that expired in between), but not so often in a row.
 MAX_REFUSALS = 3
+# Chosen: of a proxy that says longer, the store may be back sooner.
+MAX_RETRY_AFTER_S = 3600.0
 REFUSALS = (ConflictError, InvalidInputError, LimitExceededError)
 MAX_ID_CHARACTERS = 128
 NO_STORE = "no episode_store_url is set: takes stay in the spool"
@@ -187,7 +189,8 @@ class Uploader:
                     continue
                 self._note_failure(path, error)
                 if "retry_after_s" in error.details:
-                    self._retry_after_s = float(str(error.details["retry_after_s"]))
+                    asked_s = float(str(error.details["retry_after_s"]))
+                    self._retry_after_s = min(asked_s, MAX_RETRY_AFTER_S)
                     break
         return done
 
@@ -241,14 +244,21 @@ class Uploader:
         logger.error("set_take_aside", recording_id=name, error=error.message)
 
     def _run(self) -> None:
+        problem = ""
         while not self._stopping.is_set():
-            if self._deleted is not None and self._store is not None:
-                self._deleted.remove(self._store)
-            self.upload_all()
             try:
+                if self._deleted is not None and self._store is not None:
+                    self._deleted.remove(self._store)
+                self.upload_all()
                 self.retention.sweep()
+                problem = ""
             except StorageError as error:
                 logger.warning("fail_retention", error=error.message)
+            except Exception as error:
+                # A mistake of ours, or a file that cannot be read, must not end uploads for good.
+                if repr(error) != problem:
+                    logger.exception("fail_uploads")
+                problem = repr(error)
             self._stopping.wait(max(self._period_s, self._retry_after_s))
 
     def _upload_traced(self, path: Path) -> bool:

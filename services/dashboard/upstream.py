@@ -56,7 +56,7 @@ class Upstream:
             InvalidInputError: a URL that is none.
         """
         service_address(url, what=name)
-        headers = {"authorization": f"Bearer {key.get_secret_value()}"} if key else {}
+        headers = {"authorization": f"Bearer {key.get_secret_value().strip()}"} if key else {}
         limits = httpx.Limits(max_connections=8, max_keepalive_connections=4)
         client = httpx.AsyncClient(
             base_url=url,

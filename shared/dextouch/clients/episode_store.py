@@ -60,7 +60,7 @@ class EpisodeStoreClient:
         transport: httpx.BaseTransport | None = None,
     ) -> None:
         service_address(url)
-        headers = {"authorization": f"Bearer {api_key}"} if api_key else {}
+        headers = {"authorization": f"Bearer {api_key.strip()}"} if api_key else {}
         self._http = httpx.Client(
             base_url=url.rstrip("/"),
             headers=headers,

@@ -79,7 +79,7 @@ class HttpLink:
         self._connection = kind(parts.hostname or "", parts.port, timeout=timeout_s)
         self._where = f"{parts.scheme}://{parts.netloc.rsplit('@', 1)[-1]}"
         self._prefix = parts.path.rstrip("/")
-        self._headers = {} if api_key is None else {"Authorization": f"Bearer {api_key}"}
+        self._headers = {} if api_key is None else {"Authorization": f"Bearer {api_key.strip()}"}
         self._patience_s = patience_s
         self._pause = pause
         self._has_answered = False
