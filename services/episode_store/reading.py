@@ -275,6 +275,10 @@ class ImagesQuery(SpanQuery):
 Images = Annotated[ImagesQuery, Query()]
 
 
+# Differences of two fit int64; until the year 2116.
+Nanoseconds = Annotated[int, Field(gt=-(2**62), lt=2**62)]
+
+
 class SignalsQuery(FrozenModel):
     """Query of signals, a comma-separated list, in `points` bins of [start_ns, stop_ns).
 
@@ -283,8 +287,8 @@ class SignalsQuery(FrozenModel):
     """
 
     names: str = Field(min_length=1, max_length=2000)
-    start_ns: int
-    stop_ns: int
+    start_ns: Nanoseconds
+    stop_ns: Nanoseconds
     points: int = Field(default=600, ge=1, le=4000)
 
 

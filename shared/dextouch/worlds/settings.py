@@ -17,6 +17,7 @@ class RolloutLimits(FrozenModel):
     ttl_s: float = Field(
         default=600.0,
         gt=0,
+        lt=1e9,
         description="seconds until an unused rollout expires; every chunk restarts them",
     )
 

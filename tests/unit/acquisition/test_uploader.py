@@ -337,6 +337,30 @@ def test_thread_uploads_and_stops(tmp_path):
     assert store.is_closed
 
 
+def test_a_mistake_does_not_end_the_uploads(tmp_path, monkeypatch):
+    uploader = Uploader(tmp_path, FakeStore(), period_s=0.01)
+    monkeypatch.setattr(uploader.retention, "sweep", lambda: 1 / 0)
+    uploader.start()
+    for name in ("a", "b"):
+        spool(tmp_path, name)
+        while not (tmp_path / name / UPLOADED_FILE).exists():
+            assert uploader._thread.is_alive()
+            uploader._stopping.wait(0.005)
+    uploader.stop()
+
+
+def test_a_store_is_asked_again_after_an_hour_at_most(tmp_path, monkeypatch):
+    def refuse(_):
+        raise UnavailableError("store: away", retry_after_s=10**12)
+
+    spool(tmp_path)
+    store = FakeStore()
+    monkeypatch.setattr(store, "create", refuse)
+    uploader = Uploader(tmp_path, store, period_s=1.0)
+    assert uploader.upload_all() == []
+    assert uploader._retry_after_s == 3600.0
+
+
 def test_no_connection_outlives_the_uploads(tmp_path):
     spool(tmp_path)
     with socket.create_server(("127.0.0.1", 0)) as server:
@@ -377,6 +401,16 @@ def test_batches_of_large_images_are_small():
     image = STREAMS[0].model_copy(update={"shape": (480, 640, 3), "dtype": "uint8"})
     assert batch_samples(image) == 9
     assert batch_samples(STREAMS[0]) == 120
+
+
+def test_a_note_that_cannot_be_read_does_not_end_the_uploads(tmp_path):
+    # As on a bad sector, or of another user.
+    (spool(tmp_path, "a") / UPLOADED_FILE).mkdir()
+    spool(tmp_path, "b")
+    uploader = Uploader(tmp_path, FakeStore(), period_s=1.0)
+    assert uploader.upload_all() == ["b"]
+    assert "note the upload of 'a'" in uploader.status()[0].error
+    assert uploader.counts() == {"waiting": 1, "uploaded": 1, "refused": 0}
 
 
 def test_a_damaged_take_does_not_keep_the_others(tmp_path):

@@ -249,6 +249,8 @@ async def test_images_are_those_of_the_span(http, store):
         ("rollout/e-1", 422),
         ("episode/..%2Fe-1", 404),
         ("episode/e-1/signals?names=tactile_left&start_ns=5&stop_ns=5", 422),
+        (f"episode/e-1/signals?names=tactile_left&start_ns={-(2**63)}&stop_ns=9", 422),
+        (f"episode/e-1/signals?names=tactile_left&start_ns={-(10**30)}&stop_ns=9", 422),
         ("episode/e-1/signals?names=tactile_left.320&start_ns=0&stop_ns=5", 422),
         ("episode/e-1/signals?names=tactile_left.%C2%B2&start_ns=0&stop_ns=5", 422),
         ("episode/e-1/signals?names=camera_head&start_ns=0&stop_ns=5", 422),

@@ -242,8 +242,14 @@ def test_a_key_with_the_scope_is_needed_where_keys_are_set():
         {"name": "reader", "key": KEY[::-1], "scopes": ["read"]},
     )
     settings = WorldServiceSettings.model_validate({"api_keys": keys})
-    with served(create_world_app({"sum": fakes.SumWorld()}, settings)) as url:
+    app = create_world_app({"sum": fakes.SumWorld()}, settings)
+    with served(app) as url:
         with opened(url, KEY) as client:
+            assert client.infer({"start": START})["rollout"]["next_chunk"] == 0
+            app.state.access.set_keys(settings.api_keys[1:])
+            with pytest.raises(RuntimeError, match="unknown key"):
+                client.infer({"start": START})
+            app.state.access.set_keys(settings.api_keys)
             assert client.infer({"start": START})["rollout"]["next_chunk"] == 0
         for key in (None, "another-key-of-letters", KEY[::-1]):
             with pytest.raises((InvalidStatus, ConnectionClosed)), opened(url, key):
