@@ -58,12 +58,25 @@ def test_separable_endings_stay_finite():
     assert (told < 1).all()
 
 
-def test_a_judge_that_is_always_wrong_knows_nothing():
-    rng = np.random.default_rng(2)
-    odds = rng.normal(size=400)
-    told = fit_calibration(odds, odds < 0).probabilities(odds)
+@pytest.mark.parametrize("confidence", [-5.0, 0.0, 5.0])
+def test_a_judge_that_is_always_wrong_knows_nothing(confidence):
+    odds = np.random.default_rng(2).normal(size=400)
+    came, said = odds < 0, odds + confidence
+    told = fit_calibration(said, came).probabilities(said)
     assert np.ptp(told) < 0.01
-    assert told.mean() == pytest.approx((odds < 0).mean(), abs=0.02)
+    assert told == pytest.approx(np.full(400, came.mean()), abs=0.02)
+    both = sigmoid(np.stack([said, said]))
+    joint = fit_combination(*both, came).probabilities(*both)
+    assert joint == pytest.approx(np.full(400, came.mean()), abs=0.02)
+
+
+def test_estimates_that_are_always_even_leave_the_base_rate():
+    came = np.arange(40) % 4 == 0
+    assert fit_calibration(np.zeros(40), came).probabilities(np.zeros(1)) < 0.4
+    probe = np.where(came, 0.8, 0.3)
+    joint = fit_combination(probe, np.full(40, 0.5), came)
+    told = joint.probabilities(probe, np.full(40, 0.5))
+    assert ((told > 0.5) == came).all()
 
 
 def test_the_band_leaves_the_allowed_risk():
