@@ -68,6 +68,8 @@ ORPHAN_AGE = timedelta(days=1)
 _PARALLEL_REQUESTS = 8
 # Listing one group takes a request, listing all of them one per 1000 objects.
 _MAX_ONE_BY_ONE = 20
+# Named in a line of the log.
+_MAX_PLACES = 10
 
 
 class ObjectFile:
@@ -434,10 +436,11 @@ def sweep_orphans(bucket: Bucket, *, now: datetime | None = None) -> int:
     """Remove objects of abandoned uploads and deletions, and return the number of groups.
 
     The whole bucket is listed. ORPHAN_AGE counts back from `now`, the present by default. Changes
-    of that age are removed, too, except the last one.
+    of that age are removed, too, except the last one. What may not be deleted stays, with one line
+    of the log.
     """
     limit = (datetime.now(UTC) if now is None else now) - ORPHAN_AGE
-    removed = 0
+    removed, refused = 0, dict[str, str]()
     for kind in KINDS:
         groups: dict[str, list[ObjectFacts]] = {}
         for facts in bucket.list(f"{kind}s"):
@@ -447,17 +450,37 @@ def sweep_orphans(bucket: Bucket, *, now: datetime | None = None) -> int:
             is_old = max(facts.modified for facts in files) < limit
             if not is_old or f"{group}/{COMMIT_FILE}" in keys:
                 continue
-            bucket.put(f"{group}/{CLAIM_FILE}", _DELETING)
-            # It may have become active since it was listed.
-            if bucket.head(f"{group}/{COMMIT_FILE}") is None:
-                _remove_files(bucket, group, keys)
-                removed += 1
+            try:
+                removed += _remove_orphan(bucket, group, keys)
+            except StorageError as error:
+                refused[group] = error.message
     changes = sorted(_announced(bucket), key=lambda facts: facts.modified)
     try:
         bucket.remove([facts.key for facts in changes[:-1] if facts.modified < limit])
     except StorageError as error:
-        logger.warning("changes_not_removed", reason=error.message)
+        refused[CHANGES] = error.message
+    if refused:
+        logger.warning(
+            "orphans_not_removed",
+            count=len(refused),
+            places=[*refused][:_MAX_PLACES],
+            reason=next(iter(refused.values())),
+            advice="they only take space; allow s3:DeleteObject, the next sweep removes them",
+        )
     return removed
+
+
+def _remove_orphan(bucket: Bucket, group: str, keys: list[str]) -> bool:
+    """Remove a group without a commit record; False if it has one meanwhile."""
+    # A file that is not there, to be refused before the claim is marked: that would keep what waits
+    # in an outbox from being uploaded ever.
+    bucket.remove([f"{group}/none"])
+    bucket.put(f"{group}/{CLAIM_FILE}", _DELETING)
+    # It may have become active since it was listed.
+    if bucket.head(f"{group}/{COMMIT_FILE}") is not None:
+        return False
+    _remove_files(bucket, group, keys)
+    return True
 
 
 def _announce(bucket: Bucket, group: str) -> None:
