@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Int64
+from jaxtyping import Bool, Int64
 
 from dextouch.clocks import (
     corrected_stamps,
@@ -14,7 +14,7 @@ from dextouch.clocks import (
     prefers_sequence,
     unwrap_counter,
 )
-from dextouch.clocks.clock_model import MIN_SAMPLES
+from dextouch.clocks.clock_model import AHEAD_NS, MIN_SAMPLES
 from dextouch.errors import ClockFitError, InvalidInputError
 from dextouch.schemas import ClockMethod, ClockReport, ClockWarning
 from dextouch.streams import NO_DEVICE_TIME, NO_SEQUENCE, SampleBatch, StreamDescriptor
@@ -209,8 +209,10 @@ def _fitted(
         device_ns = corrected_stamps(device_ns, batch.t_host_ns)
     model, num_lost = fit_clock(device_ns, batch.t_host_ns), 0
     if not (batch.sequence == NO_SEQUENCE).any():
+        starts = np.flatnonzero(_restarts(batch, descriptor)) + 1
         bits = descriptor.capabilities.sequence_bits
-        num_lost = count_lost_samples(batch.sequence, bits=bits)
+        parts = np.split(batch.sequence, starts)
+        num_lost = sum(count_lost_samples(part, bits=bits) for part in parts)
     return _Dated(
         model.to_host_ns(device_ns, batch.t_host_ns),
         method,
@@ -221,6 +223,13 @@ def _fitted(
         model.lateness_ns,
         model.has_unsure_stops,
     )
+
+
+def _restarts(batch: SampleBatch, descriptor: StreamDescriptor) -> Bool[np.ndarray, " steps"]:
+    """Whether the number after each sample is far ahead of its arrival: the device began anew."""
+    bits, period_ns = descriptor.capabilities.sequence_bits, descriptor.period_ns()
+    numbers_ns = _unwrap(batch.sequence * period_ns, bits, period_ns, batch)
+    return np.asarray(np.diff(numbers_ns) - np.diff(batch.t_host_ns) > AHEAD_NS)
 
 
 def _counted(batch: SampleBatch, period_ns: int) -> _Dated:

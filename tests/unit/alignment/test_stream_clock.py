@@ -164,6 +164,28 @@ def test_a_stream_of_few_samples_is_dated_by_their_arrival(stamps, numbers, coun
     np.testing.assert_array_equal(timed.t_host_ns, batch.t_host_ns - 1000)
 
 
+@pytest.mark.parametrize("stamps", [True, False])
+@pytest.mark.parametrize("bits", [16, 32])
+def test_a_device_that_starts_anew_has_lost_what_it_did_not_send_alone(stamps, bits):
+    """Its counter begins at 0 again after more than half of its way: the nearer way is ahead."""
+    index = np.arange(COUNT, dtype=np.int64)
+    is_new = index >= 150
+    _, descriptor = take(stamps=stamps, numbers=True)
+    capabilities = descriptor.capabilities.model_copy(update={"sequence_bits": bits})
+    true_ns = 10**12 + index * PERIOD_NS + is_new * 2_000_000_000
+    batch = SampleBatch(
+        t_host_ns=true_ns + index * 7919 % 97 * 5000,
+        t_device_ns=np.where(is_new, index - 150, index + 1000) * PERIOD_NS
+        if stamps
+        else -(index**0),
+        sequence=np.where(is_new, index - 150, index + round(0.55 * 2**bits)),
+        values=np.zeros((COUNT, 1), dtype=np.float32),
+    )
+    timed = time_stream(batch, descriptor.model_copy(update={"capabilities": capabilities}))
+    assert (timed.report.num_steps, timed.report.num_dropped) == (1, 0)
+    np.testing.assert_allclose(timed.t_host_ns - true_ns, 0, atol=100_000)
+
+
 def test_a_counter_beyond_its_bits_is_refused_with_the_name_of_its_stream():
     batch, descriptor = take(stamps=True, numbers=True)
     narrow = ClockCapabilities(device_time=True, sequence=True, device_time_bits=24)
