@@ -59,6 +59,7 @@ class RecordedTake:
     start: MatchedStart
     success: bool
     actions: Float64[np.ndarray, "steps 67"]
+    model_rate_hz: float
 
 
 def read_takes(
@@ -95,7 +96,7 @@ def _read_take(reader: EpisodeReader, *, number: int) -> RecordedTake:
         grid.K_head,
         grid.action_kind,
     )
-    return RecordedTake(about.episode_id, start, grid.success, grid.sent[1:])
+    return RecordedTake(about.episode_id, start, grid.success, grid.sent[1:], about.model_rate_hz)
 
 
 @dataclass(frozen=True)
@@ -184,7 +185,8 @@ def score_recorded(
     Rollouts last as long as their takes, whole chunks of the world; a failed one is recorded as a
     failure, and the others continue. `trained_on` maps trained components, beside the judge, to
     digests of their training starts. Raises ConflictError for a take that was trained on, and
-    InvalidInputError for a task, touch, images or a length that the world or the judge do not know.
+    InvalidInputError for a task, touch, images, a rate or a length that the world or the judge do
+    not know.
     """
     digests = [digest for take in takes for digest in _digests(take.start)]
     judged = {"the success classifier": probe.metadata.training_starts}
@@ -193,6 +195,7 @@ def score_recorded(
     check_judged_touch({description.name: description})
     multiple = description.chunk_multiple
     for take in takes:
+        description.check_rate(take.model_rate_hz, of=f"take {take.episode_id!r}")
         task = take.start.task
         if task not in description.tasks or task not in probe.metadata.settings["instructions"]:
             raise InvalidInputError(

@@ -10,6 +10,7 @@ from dextouch.clients import Policy
 from dextouch.command_line import write_result
 from dextouch.episodes import EpisodeReader, EpisodeStore, needs, select_episodes
 from dextouch.errors import UnknownNameError
+from dextouch.schemas import CHUNK_STEPS
 from dextouch.serving import configure_logging
 from services.evaluation.bundled_policies import bundled_policy, trained_policy, training_starts_of
 from services.evaluation.matched_starts import WorldAddress
@@ -57,7 +58,10 @@ def prediction_main(arguments: Sequence[str]) -> int:
     world = open_world(path, sampling=sampling, needs_touch=False)
     tasks = options.tasks or world.description.tasks
     readers = select_episodes(
-        [store], domain="robot", tasks=tasks, needs=(needs.EVERY_PART, needs.IMAGES)
+        [store],
+        domain="robot",
+        tasks=tasks,
+        needs=(needs.EVERY_PART, needs.IMAGES, needs.longer_than(CHUNK_STEPS)),
     )
     ids = [reader.item_id for reader in readers]
     refuse_trained_episodes(store, ids, path, command="evaluate prediction")

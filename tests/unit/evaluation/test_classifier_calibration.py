@@ -1,5 +1,7 @@
 """Calibration figures by hand, and temperatures that are known because we made the outcomes."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -15,6 +17,7 @@ from services.evaluation.classifier_calibration import (
 from services.evaluation.endings import Ending, EndingEpisode
 from services.evaluation.scores import LEAST_DECIDED
 from services.evaluation.success_classifier import Calibration, Combination, sigmoid
+from services.evaluation.success_classifier_training import ClassifierSets
 
 # Allowed share of wrong answers among what is decided.
 RISK = 0.10
@@ -220,3 +223,6 @@ def test_true_endings_that_show_poses_alone_are_left_out():
     assert success.tolist() == [True]
     imagined, _ = final_endings(episodes, "t", "imagined")
     assert [one.object_poses is poses for one in imagined] == [True]
+    held_out = [episodes[1], replace(episodes[0], success=False)]
+    with pytest.raises(InvalidInputError, match="1 true takes of 't' that end with images"):
+        ClassifierSets(episodes, [], held_out).check_measurable()
