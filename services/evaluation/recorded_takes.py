@@ -68,8 +68,11 @@ def read_takes(
     tasks: Sequence[str] = (),
     splits: Collection[Split] = (),
     most: int | None = None,
+    further_views: Sequence[str] = (),
 ) -> list[RecordedTake]:
     """Robot episodes of known outcome, whatever recorded them; imagined ones are left out.
+
+    Starts have the images of those `further_views` that a take has.
 
     `tasks` and `splits` of scenes are empty for all; of each task the first `most` by their ids are
     read, None for all. Raises NotFoundError and ConflictError as `select_episodes`.
@@ -81,17 +84,17 @@ def read_takes(
         task = reader.attributes.task
         counts[task] += 1
         if most is None or counts[task] <= most:
-            takes.append(_read_take(reader, number=len(takes)))
+            takes.append(_read_take(reader, len(takes), further_views))
     return takes
 
 
-def _read_take(reader: EpisodeReader, *, number: int) -> RecordedTake:
+def _read_take(reader: EpisodeReader, number: int, further_views: Sequence[str]) -> RecordedTake:
     grid, about = EpisodeGrid(reader), reader.attributes
     start = MatchedStart(
         about.task,
         number,
         about.instruction,
-        grid.observation(),
+        grid.observation(further_views=further_views),
         grid.anchor,
         grid.K_head,
         grid.action_kind,

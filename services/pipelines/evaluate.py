@@ -119,7 +119,14 @@ def recorded_main(arguments: Sequence[str]) -> int:
     options = recorded_parser().parse_args(list(arguments))
     stores = [EpisodeStore(url) for url in options.episodes]
     splits = (options.split,) if options.split else ()
-    takes = read_takes(stores, tasks=options.tasks, splits=splits, most=options.count)
+    world = open_world(options.checkpoint)
+    takes = read_takes(
+        stores,
+        tasks=options.tasks,
+        splits=splits,
+        most=options.count,
+        further_views=world.description.optional_cameras,
+    )
     ids = {take.episode_id for take in takes}
     for store in stores:
         own = sorted(ids & set(store.list()))
@@ -128,7 +135,7 @@ def recorded_main(arguments: Sequence[str]) -> int:
     probe = SuccessClassifier.load(options.probe)
     torch.set_num_threads(1)
     configure_logging(service="evaluate_recorded", log_format="auto", level="warning")
-    with served_world(open_world(options.checkpoint)) as client:
+    with served_world(world) as client:
         (description,) = [one for one in client.worlds() if one.name == WORLD]
         scores = score_recorded(
             takes,

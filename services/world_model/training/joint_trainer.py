@@ -21,6 +21,7 @@ from dextouch.tactile.layout import common_layout
 from services.networks import optimizer
 from services.networks.weight_files import on_device
 from services.world_model import checkpoints
+from services.world_model.network.attention import recomputed
 from services.world_model.network.codecs import to_unit
 from services.world_model.network.configuration import NetworkConfig, WanFiles, num_latents
 from services.world_model.network.inputs import PastRule, build_inputs
@@ -121,7 +122,7 @@ class TrainingRun:
         if settings.freeze_video or (wan is not None and wan.lora_rank):
             freeze_pretrained(model)
         for layer in model.joint_layers():
-            layer.recompute = settings.recompute
+            layer.recompute = recomputed if settings.recompute else None
         self.processes.shard(model, model.layers, whole=(model.codec, model.tokenizer))
 
     def _start_averages(self) -> None:
@@ -478,7 +479,7 @@ def _metadata(
         tokenizer_digest=before.tokenizer_digest if before else None,
         text_dropout=dropped[0],
         action_dropout=dropped[1],
-        view_dropout=windows.view_dropout if network.further_views else 0.0,
+        view_dropout=checkpoints.view_dropout(windows.view_dropout, network, before),
     )
 
 
