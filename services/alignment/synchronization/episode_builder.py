@@ -44,6 +44,7 @@ from services.alignment.synchronization.grid_actions import (
 )
 from services.alignment.synchronization.recorded_streams import (
     Block,
+    Conversion,
     DatedStream,
     EpisodeStream,
     LoadedStream,
@@ -375,7 +376,7 @@ def find_span(
         on_progress(progress_within("placing", number / len(names), name))
         # Pressures of an hour do not fit in memory, the forces of its pads do.
         layout = streams[name].descriptor.tactile_layout
-        of = partial(_pad_forces_n, layout) if name in TOUCH_STREAMS else np.asarray
+        of: Conversion = partial(_pad_forces_n, layout) if name in TOUCH_STREAMS else np.asarray
         parts[name] = _seen(streams[name].load(of))
         if name not in TOUCH_STREAMS and len(parts[name].t_ns) < MIN_USABLE:
             # Such as a hand that was never seen.
