@@ -380,7 +380,7 @@ def stored(tmp_path):
     for seed in range(6):
         episode = with_wrists(make_episode(seed))
         further = (episode.further[0], None) if seed == 5 else episode.further
-        write_episode(store, replace(episode, further=further))
+        write_episode(store, replace(episode, further=further), success=True)
     return store
 
 
