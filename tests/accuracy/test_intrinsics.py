@@ -255,7 +255,7 @@ def test_markers_of_another_size_than_entered_are_refused_with_their_size(legacy
     photos = charuco_photos(CharucoBoard(5, 6, 0.03, 0.022), legacy=legacy)
     for close_m in (0.021, 0.0235):
         assert len(find_boards(photos, CharucoBoard(5, 6, 0.03, close_m)).photos) == 6
-    for wrong_m in (0.010, 0.015, 0.018, 0.026, 0.029):
+    for wrong_m in (0.010, 0.015, 0.018, 0.027, 0.029):
         board = CharucoBoard(5, 6, 0.03, wrong_m)
         with pytest.raises(InvalidInputError, match=r"measure 0.7\d of a square") as refused:
             find_boards(photos, board)
