@@ -9,7 +9,7 @@ import math
 import weakref
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from functools import partial, reduce
-from typing import Any, ClassVar, Final, cast
+from typing import Any, ClassVar, Final
 
 import torch
 from torch import Tensor
@@ -102,14 +102,14 @@ class MetaTrace(TorchDispatchMode):  # type: ignore[no-untyped-call]
         self._regarded_bytes -= regarded
 
 
-def _form(value: object) -> Hashable:
+def _form(value: Any) -> Hashable:  # noqa: ANN401 - any argument of an operation
     """What the results of an operation depend on, but for their values."""
     if isinstance(value, Tensor):
         return value.shape, value.stride(), value.dtype
     if isinstance(value, tuple | list):
         return tuple(map(_form, value))
     # One, True and 1.0 are equal.
-    return type(value), cast("Hashable", value)
+    return type(value), value
 
 
 def _recipe(result: object, given: object) -> object:
@@ -149,10 +149,11 @@ def _computed(func: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> ob
 def _pointwise(packet: object, *args: Any, memory_format: Any = None, **_: object) -> Tensor | None:  # noqa: ANN401
     """A tensor of the broadcast shape and common kind; None where that is another."""
     tensors = [one for one in args if isinstance(one, Tensor)]
-    shape = tuple(reduce(_broadcast, (one.shape for one in tensors)))
+    shapes: list[Sequence[int]] = [one.shape for one in tensors]
+    shape = tuple(reduce(_broadcast, shapes))
     values = args[1:] if packet is _ATEN.where else args
     numbers = [one for one in values if isinstance(one, Tensor | int | float)]
-    dtype = numbers[0].dtype if len(numbers) == 1 else _common(numbers)
+    dtype = tensors[-1].dtype if len(numbers) == 1 else _common(numbers)
     if packet in _COMPARISONS:
         dtype = torch.bool
     elif packet in _TO_FLOATS and not dtype.is_floating_point:
@@ -177,7 +178,7 @@ def _common(numbers: Sequence[Any]) -> torch.dtype:
     return torch.result_type(first, others[-1])
 
 
-def _broadcast(one: Sequence[int], other: Sequence[int]) -> list[int]:
+def _broadcast(one: Sequence[int], other: Sequence[int]) -> Sequence[int]:
     rank = max(len(one), len(other))
     pairs = zip(*([1] * (rank - len(x)) + list(x) for x in (one, other)), strict=True)
     return [b if a == 1 else a for a, b in pairs]
