@@ -312,7 +312,8 @@ def _training_plan(settings: TrainSettings, num_processes: int, depth: int) -> T
 
 def _recomputed(update: Callable[[], T]) -> T:
     """As `attention.recomputed`, without importing torch's compiler."""
-    numbers, kept = count(), {}
+    numbers = count()
+    kept: dict[int, Tensor] = {}
 
     def unpack(number: int) -> Tensor:
         if not kept:
