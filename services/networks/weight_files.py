@@ -3,16 +3,16 @@
 import hashlib
 import json
 import os
-import sys
 from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeGuard, TypeVar
+from typing import TypeVar
 
 import torch
 from pydantic import BaseModel, ValidationError
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
+from torch.distributed.tensor import DTensor, distribute_tensor
 
 from dextouch.errors import (
     CorruptDataError,
@@ -23,9 +23,6 @@ from dextouch.errors import (
     UnavailableError,
 )
 from dextouch.installation import install_command
-
-if TYPE_CHECKING:
-    from torch.distributed.tensor import DTensor
 
 # Of the services, which have weights of their own.
 _PACKAGE = Path(__file__).parents[1]
@@ -225,16 +222,9 @@ def on_device(network: Network, device: str) -> Network:
     return network.to(place)
 
 
-def is_sharded(tensor: Tensor) -> "TypeGuard[DTensor]":
-    """Whether a tensor is sharded over processes."""
-    # Takes long to import; before that, none is.
-    module = sys.modules.get("torch.distributed.tensor")
-    return module is not None and isinstance(tensor, module.DTensor)
-
-
 def memory_of(tensors: Mapping[str, Tensor]) -> int:
     """Bytes here of tensors, which may be on the meta device, or sharded over processes."""
-    here = (one.to_local() if is_sharded(one) else one for one in tensors.values())
+    here = (one.to_local() if isinstance(one, DTensor) else one for one in tensors.values())
     return sum(tensor.numel() * tensor.element_size() for tensor in here)
 
 
@@ -243,7 +233,7 @@ def allocate(network: nn.Module) -> None:
     for module in network.modules():
         for name, weight in list(module.named_parameters(recurse=False)):
             if weight.is_meta:
-                place = weight.device_mesh.device_type if is_sharded(weight) else "cpu"
+                place = weight.device_mesh.device_type if isinstance(weight, DTensor) else "cpu"
                 made = nn.Parameter(torch.empty_like(weight, device=place), weight.requires_grad)
                 setattr(module, name, made)
 
@@ -251,9 +241,7 @@ def allocate(network: nn.Module) -> None:
 @torch.no_grad()
 def fill(tensor: Tensor, whole: Tensor) -> None:
     """Copy a whole tensor into one that may be sharded, and of another precision."""
-    if is_sharded(tensor):
-        from torch.distributed.tensor import distribute_tensor
-
+    if isinstance(tensor, DTensor):
         mesh, placements = tensor.device_mesh, tensor.placements
         whole = distribute_tensor(whole, mesh, placements, src_data_rank=None)
     tensor.copy_(whole)

@@ -8,6 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 from dextouch.command_line import ProgressLines, progress, write_result
 from dextouch.serving import load_settings
+from dextouch.worlds import World, serve_worlds
+from services.networks.weight_files import digest_of
+from services.world_model import checkpoints
+from services.world_model.network.model import Sampling
 from services.world_model.paper_settings import (
     CacheCommand,
     DistillCommand,
@@ -15,17 +19,19 @@ from services.world_model.paper_settings import (
     adapt_settings,
     train_settings,
 )
+from services.world_model.plan import plan_table, training_table
 from services.world_model.settings import (
     AdaptStateCommand,
     ShowCommand,
     TrainStateCommand,
     WorldModelSettings,
 )
+from services.world_model.training.distribution import joined_processes
+from services.world_model.training.joint_trainer import TrainingProgress, TrainingReport, train
+from services.world_model.training.latent_cache import fill_latent_cache
+from services.world_model.world import open_world
 
-# Each command imports what it needs: a plan nothing that trains or serves.
 if TYPE_CHECKING:
-    from dextouch.worlds import World
-    from services.world_model.training.joint_trainer import TrainingProgress, TrainingReport
     from services.world_model.training.state_trainer import StateReport
 
 
@@ -35,8 +41,6 @@ def run_train(arguments: list[str]) -> int:
     if isinstance(settings, TrainStateCommand):
         return _train_state(settings)
     if settings.plan:
-        from services.world_model.plan import plan_table, training_table
-
         settings = settings.model_copy(update={"network": settings.with_adapters().network})
         print(plan_table(settings.network))
         print(training_table(settings, settings.plan_processes))
@@ -49,18 +53,14 @@ def run_adapt(arguments: list[str]) -> int:
     settings = load_settings(adapt_settings(arguments), arguments)
     if isinstance(settings, AdaptStateCommand):
         return _train_state(settings)
-    from services.world_model.checkpoints import read_checkpoint
-
-    network = read_checkpoint(settings.init).metadata.network
+    network = checkpoints.read_checkpoint(settings.init).metadata.network
     return _train(settings.training(network), settings.json_path)
 
 
 def run_distill(arguments: list[str]) -> int:
     """Train a checkpoint to sample in few steps, as `run_train`."""
     settings = load_settings(DistillCommand, arguments)
-    from services.world_model.checkpoints import read_checkpoint
-
-    network = read_checkpoint(settings.init).metadata.network
+    network = checkpoints.read_checkpoint(settings.init).metadata.network
     return _train(settings.training(network), settings.json_path)
 
 
@@ -69,8 +69,6 @@ def run_cache(arguments: list[str]) -> int:
     settings = load_settings(CacheCommand, arguments)
     if settings.plan:
         return run_train(arguments)
-    from services.world_model.training.latent_cache import fill_latent_cache
-
     filled = fill_latent_cache(settings, lambda some: progress(some, "latents", len(some)))
     print(
         f"{filled.path}: {filled.num_windows} windows of {filled.num_episodes} episodes, "
@@ -81,12 +79,9 @@ def run_cache(arguments: list[str]) -> int:
 
 
 def _train(settings: TrainSettings, json_path: Path | None) -> int:
-    from services.world_model.training.distribution import joined_processes
-    from services.world_model.training.joint_trainer import train
-
     lines = ProgressLines("training", has_bar=False)
 
-    def on_progress(now: "TrainingProgress") -> None:
+    def on_progress(now: TrainingProgress) -> None:
         losses = f"video {now.loss_video:.3f}  touch {now.loss_tactile:.3f}"
         lines.show(f"{100 * now.share:.0f} %  step {now.step}  {losses}")
 
@@ -121,8 +116,6 @@ def _show(report: "TrainingReport | StateReport", counts: str, json_path: Path |
 
 def run_serve(arguments: list[str]) -> int:
     """Serve a checkpoint until SIGINT or SIGTERM; rollouts of others in its folder continue."""
-    from dextouch.worlds import serve_worlds
-
     load = partial(load_settings, WorldModelSettings, arguments)
     settings = load()
     serve_worlds(
@@ -135,7 +128,7 @@ def run_serve(arguments: list[str]) -> int:
     return 0
 
 
-def open_worlds(settings: WorldModelSettings) -> "dict[str, World[Any]]":
+def open_worlds(settings: WorldModelSettings) -> dict[str, World[Any]]:
     """The world of the checkpoint to serve."""
     import torch
 
@@ -143,14 +136,11 @@ def open_worlds(settings: WorldModelSettings) -> "dict[str, World[Any]]":
     return {settings.world_name: open_model(settings.checkpoint, settings)}
 
 
-def open_by_digest(settings: WorldModelSettings, _: str, digest: str) -> "World[Any] | None":
+def open_by_digest(settings: WorldModelSettings, _: str, digest: str) -> World[Any] | None:
     """The world of the checkpoint with this digest beside the one that is served.
 
     Of the options, it gets those that it can take.
     """
-    from services.world_model import checkpoints
-    from services.world_model.world import open_world
-
     for path, found in checkpoints.list_checkpoints(settings.checkpoint.parent).items():
         if found == digest and checkpoints.is_state_checkpoint(path):
             return open_world(path)
@@ -165,11 +155,8 @@ def open_by_digest(settings: WorldModelSettings, _: str, digest: str) -> "World[
     return None
 
 
-def open_model(path: Path, settings: WorldModelSettings) -> "World[Any]":
+def open_model(path: Path, settings: WorldModelSettings) -> World[Any]:
     """The world of a checkpoint, as the settings say."""
-    from services.world_model.network.model import Sampling
-    from services.world_model.world import open_world
-
     return open_world(
         path,
         sampling=Sampling(settings.sampling_steps, settings.sampler, guidance=settings.guidance),
@@ -180,13 +167,9 @@ def open_model(path: Path, settings: WorldModelSettings) -> "World[Any]":
 
 def run_show(arguments: list[str]) -> int:
     """Print the metadata of one checkpoint, or of every checkpoint in a folder."""
-    from services.world_model import checkpoints
-
     settings = load_settings(ShowCommand, arguments)
     path = settings.checkpoint
     if settings.plan:
-        from services.world_model.plan import plan_table
-
         print(plan_table(checkpoints.read_metadata(path).network))
         return 0
     found = [
@@ -198,9 +181,6 @@ def run_show(arguments: list[str]) -> int:
 
 
 def _history(file: Path) -> dict[str, Any]:
-    from services.networks.weight_files import digest_of
-    from services.world_model import checkpoints
-
     if checkpoints.is_tokenizer(file):
         stored = checkpoints.read_tokenizer(file)
         about = stored.metadata.model_dump(mode="json", exclude={"train_scenes"})

@@ -3,31 +3,25 @@
 The network runs on torch's meta device. FLOPs are two per multiplication and addition of matrix
 products, convolutions and attention; memory is the largest sum of tensors alive at one time, with
 the whole matrix of attention and without working memory of libraries. Deep models are planned from
-a few layers, the published autoencoder at the presets' size from figures. In training activations
-count in float32.
+a few layers. In training activations count in float32.
 """
 
-from collections.abc import Callable, Iterable
+import weakref
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, is_dataclass, replace
 from functools import cache, partial
-from itertools import count
-from typing import Final, TypeVar, cast
+from typing import Any, Final, TypeVar, cast
 
 import torch
 from torch import Tensor, nn
-from torch.autograd.graph import saved_tensors_hooks
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
+from torch.utils.flop_counter import FlopCounterMode
 
 from services.networks.optimizer import learned_weights
 from services.networks.weight_files import memory_of
-from services.world_model.meta_device import MetaTrace
 from services.world_model.network.attention import CAMERA_DIM, HAND_DIM
-from services.world_model.network.codecs import WanVideoCodec
-from services.world_model.network.configuration import (
-    NetworkConfig,
-    Precision,
-    WanConfig,
-    num_latents,
-)
+from services.world_model.network.configuration import NetworkConfig, Precision, num_latents
 from services.world_model.network.inputs import GEOMETRY_SIZE, ModelInputs, kept_bytes
 from services.world_model.network.instruction import MAX_WORDS, key_of
 from services.world_model.network.model import Context, FirstLatents, JointLatents, JointWorldModel
@@ -40,15 +34,12 @@ _DECODING: Final = ("decode all images", "decode the last image")
 # Cards that choices of a training are compared with, in 1e9 bytes as all of the plan.
 _CARDS_GB: Final = (24, 80, 141)
 # Layers that deeper models are planned from.
-_FEW_LAYERS: Final = (2, 3)
-# Text encoder of the published model, UMT5-XXL: embeddings; of 24 layers projections, the gated
-# feed-forward network, relative positions and two norms; the last norm.
-_TEXT_WIDTH: Final = 4096
-_TEXT_ENCODER_WEIGHTS: Final = (
-    256_384 * _TEXT_WIDTH
-    + _TEXT_WIDTH
-    + 24 * (4 * _TEXT_WIDTH**2 + 3 * _TEXT_WIDTH * 10_240 + 32 * 64 + 2 * _TEXT_WIDTH)
-)
+_FEW_LAYERS: Final = (3, 4)
+# Text encoder of the published model, UMT5-XXL.
+_TEXT_ENCODER: Final = {
+    "vocab_size": 256384, "d_model": 4096, "d_kv": 64, "d_ff": 10240, "num_layers": 24,
+    "num_heads": 64,
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -123,21 +114,45 @@ class TrainingPlan:
         return self.whole + shared // self.shards + gathered + max(self.step, self.encoding)
 
 
-T = TypeVar("T")
 PlanT = TypeVar("PlanT", Plan, TrainingPlan)
 
 
-# What `_codec_work`, `_encoding_bytes` and `_codec_part` find for one view of the published
-# autoencoder at the presets' size, with the tokenizer of `paper`, which takes a millionth of it:
-# to trace it takes longer than all else, and importing diffusers twice as long again.
-_PUBLISHED_SIZE: Final = {"wan": WanConfig(precision="float32"), "image_px": 256, "max_steps": 17}
-_PUBLISHED_WEIGHTS: Final = 704_688_668
-_PUBLISHED_WORK: Final = (
-    Work("encode the first image", 1, 304_503_934_464, 130_358_784),
-    Work(_DECODING[0], 1, 20_779_000_217_600, 1_223_045_632),
-    Work(_DECODING[1], 1, 17_349_502_386_176, 1_163_276_800),
-)
-_PUBLISHED_WINDOW_BYTES: Final = 511_425_536
+class PeakMemory(TorchDispatchMode):  # type: ignore[no-untyped-call]
+    """Largest sum of the tensors made inside the context and alive at one time, in bytes."""
+
+    def __init__(self, given: Iterable[Tensor]) -> None:
+        super().__init__()  # type: ignore[no-untyped-call]
+        self.peak_bytes = 0
+        self._now_bytes = 0
+        # Views share the storage of their tensor. Held, since storages are known by identity.
+        self._given = [tensor.untyped_storage() for tensor in given]
+        self._alive = weakref.WeakSet(self._given)
+
+    def __torch_dispatch__(
+        self,
+        func: Callable[..., object],
+        types: object,
+        args: tuple[object, ...] = (),
+        kwargs: Mapping[str, object] | None = None,
+    ) -> object:
+        """Run an operation and count its new tensors."""
+        result = func(*args, **(kwargs or {}))
+        for leaf in tree_leaves(result):
+            if isinstance(leaf, Tensor):
+                self._count(leaf.untyped_storage())
+        return result
+
+    def _count(self, storage: torch.UntypedStorage) -> None:
+        if storage in self._alive:
+            return
+        size = storage.nbytes()
+        self._alive.add(storage)
+        self._now_bytes += size
+        self.peak_bytes = max(self.peak_bytes, self._now_bytes)
+        weakref.finalize(storage, self._free, size)
+
+    def _free(self, size: int) -> None:
+        self._now_bytes -= size
 
 
 def plan_table(config: NetworkConfig) -> str:
@@ -209,21 +224,11 @@ def _further(few: object, more: object, num: int) -> object:
     return more
 
 
-@cache
-def _model(config: NetworkConfig, *, is_frozen: bool) -> JointWorldModel:
-    """A network without weights and, at full size, without its codec."""
-    with torch.device("meta"), MetaTrace():
-        model = JointWorldModel(config, None if config.wan is None else nn.Identity())
-    if is_frozen:
-        freeze_pretrained(model)
-    return model
-
-
 def _plan_of(config: NetworkConfig, depth: int) -> Plan:
     config = config.model_copy(update={"num_layers": depth})
     steps = config.max_steps - 1
     with torch.device("meta"), torch.no_grad():
-        model = _model(config, is_frozen=False).eval()
+        model = JointWorldModel(config).eval()
         work, kept_bytes = _work(model, 1 + steps)
         return Plan(
             num_steps=steps,
@@ -288,48 +293,24 @@ def _training_plan(settings: TrainSettings, num_processes: int, depth: int) -> T
     shards = max(1, num_processes // settings.replicas)
     windows = max(1, settings.optimizer.batch // (num_processes * settings.accumulate))
     with torch.device("meta"):
-        is_frozen = settings.freeze_video or settings.lora.rank > 0
-        model, num_parts = _model(config, is_frozen=is_frozen), min(settings.accumulate, 2)
-        steps = _step_bytes(
-            config, windows, num_parts, is_frozen=is_frozen, recompute=settings.recompute
-        )
-        codec, tokenizer = _codec_part(model).memory_bytes, memory_of(model.tokenizer.state_dict())
+        model = JointWorldModel(config).train()
+        if settings.freeze_video or settings.lora.rank:
+            freeze_pretrained(model)
+        for layer in model.joint_layers():
+            layer.recompute = settings.recompute
+        whole = sum(memory_of(part.state_dict()) for part in (model.codec, model.tokenizer))
         layers, weights = memory_of(model.layers.state_dict()), memory_of(model.state_dict())
-        weights += codec - memory_of(model.codec.state_dict())
-        whole = codec + tokenizer
         return TrainingPlan(
             weights=weights,
             whole=whole,
             learned=memory_of(learned_weights(model)),
             outer=weights - whole - layers,
             layer=memory_of(model.joint_layers()[0].state_dict()),
-            step=steps[shards > 1],
+            step=_step_bytes(model, windows, min(settings.accumulate, 2), is_sharded=shards > 1),
             encoding=_encoding_bytes(_of_codec(config), windows),
             copies=2 + (settings.optimizer.ema_decay > 0.0),
             shards=shards,
         )
-
-
-def _recomputed(update: Callable[[], T]) -> T:
-    """As `attention.recomputed`, without importing torch's compiler."""
-    numbers = count()
-    kept: dict[int, Tensor] = {}
-
-    def unpack(number: int) -> Tensor:
-        if not kept:
-            again = count()
-            with (
-                torch.enable_grad(),
-                saved_tensors_hooks(
-                    lambda saved: kept.update({next(again): saved.detach()}),
-                    lambda _: torch.zeros(()),
-                ),
-            ):
-                update()
-        return kept.pop(number)
-
-    with saved_tensors_hooks(lambda _: next(numbers), unpack):
-        return update()
 
 
 def _of_codec(config: NetworkConfig) -> NetworkConfig:
@@ -344,146 +325,109 @@ def _of_codec(config: NetworkConfig) -> NetworkConfig:
 @cache
 def _encoding_bytes(config: NetworkConfig, num_windows: int) -> int:
     """What the codec takes for the latents of some windows."""
-    if _is_published(config):
-        num = num_windows * config.num_views
-        return _PUBLISHED_WINDOW_BYTES + (num - 1) * config.max_steps * _image_bytes(config)
     with torch.device("meta"), torch.no_grad():
         codec = JointWorldModel(config).codec
         shape = config.max_steps, config.image_px, config.image_px, 3
         images = torch.zeros(num_windows * config.num_views, *shape)
-        with MetaTrace((*codec.parameters(), *codec.buffers())) as trace:
+        with PeakMemory((*codec.parameters(), *codec.buffers())) as memory:
             codec.encode(images)
-    return trace.peak_bytes
+    return memory.peak_bytes
 
 
-@cache
 def _step_bytes(
-    config: NetworkConfig, num_windows: int, num_parts: int, *, is_frozen: bool, recompute: bool
-) -> tuple[int, int]:
-    """Peaks of forward and backward of parts of a batch: with and without all gradients."""
-    model, steps = _model(config, is_frozen=is_frozen).train(), config.max_steps
-    for layer in model.joint_layers():
-        layer.recompute = _recomputed if recompute else None
-    with MetaTrace():
-        inputs = _inputs(config, steps, num_windows)
-        first, noisy = _latents(model, steps, num_windows)
-        t = torch.ones(num_windows)
-    trace = MetaTrace(_weights(model))
-    hooks = [
-        weight.register_post_accumulate_grad_hook(  # type: ignore[no-untyped-call]
-            lambda weight: trace.disregard(weight.grad)
-        )
-        for weight in learned_weights(model).values()
-    ]
-    with trace:
+    model: JointWorldModel, num_windows: int, num_parts: int, *, is_sharded: bool
+) -> int:
+    """Peak of forward and backward of parts of a batch; without gradients if these are sharded."""
+    steps = model.config.max_steps
+    inputs = _inputs(model.config, steps, num_windows)
+    first, noisy = _latents(model, steps, num_windows)
+    if is_sharded:
+        num_parts = 1
+        for weight in learned_weights(model).values():
+            weight.register_post_accumulate_grad_hook(  # type: ignore[no-untyped-call]
+                _drop_gradient
+            )
+    t = torch.ones(num_windows)
+    with PeakMemory((*model.parameters(), *model.buffers())) as memory:
         for _ in range(num_parts):
             guess = model(inputs, first, noisy, t)
             torch.autograd.backward(guess.video.square().mean() + guess.tactile.square().mean())
             del guess
-    for hook in hooks:
-        hook.remove()
-    model.zero_grad()
-    return trace.peak_bytes, trace.regarded_peak_bytes
+    return memory.peak_bytes
+
+
+def _drop_gradient(weight: Tensor) -> None:
+    weight.grad = None
 
 
 def _parts(model: JointWorldModel) -> tuple[Part, ...]:
     ends = [model.video_condition, model.video, *([model.views] if model.views else [])]
-    parts = [
-        _part("video expert", [*ends, *(layer.video for layer in model.joint_layers())]),
-        _part(
-            "tactile expert",
-            [model.tactile_condition, model.tactile, *(x.tactile for x in model.joint_layers())],
-        ),
-        _codec_part(model),
-        _part("tactile tokenizer", [model.tokenizer]),
-    ]
-    wan, num = model.config.wan, _TEXT_ENCODER_WEIGHTS
-    if wan is not None and wan.text_width == _TEXT_WIDTH:
-        name = "text encoder (once per instruction)"
-        parts.append(Part(name, num, num * wan.dtype.itemsize))
+    video = [*ends, *(layer.video for layer in model.layers)]
+    touch = [model.tactile_condition, model.tactile, *(layer.tactile for layer in model.layers)]
+    groups: dict[str, list[Any]] = {
+        "video expert": video,
+        "tactile expert": touch,
+        "visual codec": [model.codec],
+        "tactile tokenizer": [model.tokenizer],
+    }
+    wan = model.config.wan
+    if wan is not None and wan.text_width == _TEXT_ENCODER["d_model"]:
+        from transformers import UMT5Config, UMT5EncoderModel
+
+        encoder = UMT5EncoderModel(UMT5Config(**_TEXT_ENCODER)).to(wan.dtype)
+        groups["text encoder (once per instruction)"] = [encoder]
+    parts = []
+    for name, group in groups.items():
+        modules = nn.ModuleList(group)
+        # Shared weights are counted once.
+        tensors = {**dict(modules.named_parameters()), **dict(modules.named_buffers())}
+        parts.append(Part(name, sum(t.numel() for t in tensors.values()), memory_of(tensors)))
     return tuple(parts)
-
-
-def _part(name: str, group: Iterable[nn.Module | None]) -> Part:
-    modules = nn.ModuleList(cast("list[nn.Module]", group))
-    # Shared weights are counted once.
-    tensors = {**dict(modules.named_parameters()), **dict(modules.named_buffers())}
-    return Part(name, sum(t.numel() for t in tensors.values()), memory_of(tensors))
-
-
-def _codec_part(model: JointWorldModel) -> Part:
-    name, wan = "visual codec", model.config.wan
-    if _is_published(model.config):
-        return Part(name, _PUBLISHED_WEIGHTS, 4 * _PUBLISHED_WEIGHTS)
-    return _part(name, [model.codec if wan is None else WanVideoCodec(wan)])
-
-
-def _is_published(config: NetworkConfig) -> bool:
-    """Whether the figures of the published autoencoder are those of this configuration."""
-    codec = _of_codec(config)
-    return {name: getattr(codec, name) for name in _PUBLISHED_SIZE} == _PUBLISHED_SIZE
 
 
 def _work(model: JointWorldModel, num_steps: int) -> tuple[tuple[Work, ...], int]:
     """Computations of a chunk, and the memory that the sampler's steps share."""
-    with MetaTrace():
-        inputs, (first, noisy) = _inputs(model.config, num_steps), _latents(model, num_steps)
-        t = torch.ones(1)
+    config, inputs = model.config, _inputs(model.config, num_steps)
+    first, noisy = _latents(model, num_steps)
 
     def shared() -> Context:
         context = model.context(inputs, first)
         return replace(context, clean=model.clean_tokens(context, noisy))
 
-    given = _weights(model)
-    share, context = _counted("what sampler steps share", 1, shared, given)
+    context, steps = shared(), config.sampling_steps
+    jobs: dict[str, tuple[int, Callable[[], Any]]] = {
+        "what sampler steps share": (1, shared),
+        "one sampler step": (steps, lambda: model.denoise(context, noisy, torch.ones(1))),
+    }
     kept = {str(id(tensor)): tensor for tensor in _tensors_of(context)}
-    step, _ = _counted(
-        "one sampler step",
-        model.config.sampling_steps,
-        lambda: model.denoise(context, noisy, t),
-        (*given, *kept.values()),
-    )
-    encoded, *decoded = _codec_work(_of_codec(model.config), num_steps)
-    return (encoded, share, step, *decoded), memory_of(kept)
-
-
-def _image_bytes(config: NetworkConfig) -> int:
-    """An image in 0 … 1 and in -1 … 1, in float32."""
-    return 2 * 4 * 3 * config.image_px**2
+    encoded, *decoded = _codec_work(_of_codec(config), num_steps)
+    return (encoded, *_counted(jobs, model, kept.values()), *decoded), memory_of(kept)
 
 
 @cache
 def _codec_work(config: NetworkConfig, num_steps: int) -> tuple[Work, ...]:
     """Computations of codec and tokenizer, which are equal in both precisions and all depths."""
-    if _is_published(config):
-        num = config.num_views
-        sizes = [num * one.memory_bytes for one in _PUBLISHED_WORK]
-        # Encoded one by one, decoded together.
-        sizes[0] = _PUBLISHED_WORK[0].memory_bytes + (num - 1) * _image_bytes(config)
-        return tuple(
-            replace(one, flops=num * one.flops, memory_bytes=size)
-            for one, size in zip(_PUBLISHED_WORK, sizes, strict=True)
-        )
     model, inputs = JointWorldModel(config).eval(), _inputs(config, num_steps)
     first, noisy = _latents(model, num_steps)
-    jobs: dict[str, Callable[[], object]] = {
-        "encode the first image": lambda: model.first_latents(inputs),
-        _DECODING[0]: lambda: model.decode(first, noisy),
-        _DECODING[1]: lambda: model.decode(first, noisy, all_images=False),
+    jobs: dict[str, tuple[int, Callable[[], Any]]] = {
+        "encode the first image": (1, lambda: model.first_latents(inputs)),
+        _DECODING[0]: (1, lambda: model.decode(first, noisy)),
+        _DECODING[1]: (1, lambda: model.decode(first, noisy, all_images=False)),
     }
-    return tuple(_counted(name, 1, run, _weights(model))[0] for name, run in jobs.items())
+    return _counted(jobs, model)
 
 
 def _counted(
-    name: str, times: int, run: Callable[[], T], given: Iterable[Tensor]
-) -> tuple[Work, T]:
-    with MetaTrace(given) as trace:
-        result = run()
-    return Work(name, times, trace.flops, trace.peak_bytes), result
-
-
-def _weights(model: JointWorldModel) -> tuple[Tensor, ...]:
-    return *model.parameters(), *model.buffers()
+    jobs: Mapping[str, tuple[int, Callable[[], Any]]],
+    model: JointWorldModel,
+    kept: Iterable[Tensor] = (),
+) -> tuple[Work, ...]:
+    work, given = [], (*model.parameters(), *model.buffers(), *kept)
+    for name, (times, run) in jobs.items():
+        with PeakMemory(given) as memory, FlopCounterMode(display=False) as counter:
+            run()
+        work.append(Work(name, times, counter.get_total_flops(), memory.peak_bytes))
+    return tuple(work)
 
 
 def _tensors_of(kept: object) -> list[Tensor]:

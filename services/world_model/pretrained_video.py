@@ -9,6 +9,7 @@ from typing import Final
 import torch
 from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
+from torch.distributed.tensor import DTensor
 
 from dextouch.errors import CorruptDataError, InvalidInputError, NotFoundError
 from services.networks.weight_files import (
@@ -16,7 +17,6 @@ from services.networks.weight_files import (
     available_memory,
     check_memory,
     fill,
-    is_sharded,
     memory_of,
     refuse_non_finite,
 )
@@ -207,7 +207,7 @@ def load_weights(
 
 def _available(weights: Mapping[str, Tensor]) -> int | None:
     """Memory for this process's weights: that of its GPU, or its part of the machine's."""
-    meshes = [one.device_mesh for one in weights.values() if is_sharded(one)]
+    meshes = [one.device_mesh for one in weights.values() if isinstance(one, DTensor)]
     if meshes and meshes[0].device_type == "cuda":
         return torch.cuda.mem_get_info()[0]
     free = available_memory()

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Float32, Float64
 from torch import Tensor, nn
 from torch.nn import functional
+from torch.utils.checkpoint import checkpoint
 
 from dextouch.hands.actions import unpack_action
 from dextouch.hands.robot_hand import RobotHand
@@ -290,17 +291,6 @@ class ExpertBlock(Block):
         return replace(stream, tokens=tokens + (1.0 + ffn_gate) * self.ffn(normed))
 
 
-Streams = tuple[Stream, Stream | None]
-
-
-def recomputed(update: Callable[[], Streams]) -> Streams:
-    """Streams of a function that is called again for the gradients instead of keeping them."""
-    from torch.utils.checkpoint import checkpoint  # imports torch's compiler
-
-    updated: Streams = checkpoint(update, use_reentrant=False, preserve_rng_state=False)
-    return updated
-
-
 class JointLayer(nn.Module):
     """One layer: two expert blocks around one shared attention, or the video block alone."""
 
@@ -308,22 +298,22 @@ class JointLayer(nn.Module):
         super().__init__()
         self.video = video
         self.tactile = tactile
-        # How training computes the layer again, if it does not keep its activations.
-        self.recompute: Callable[[Callable[[], Streams]], Streams] | None = None
+        # Whether training computes the layer again instead of keeping its activations.
+        self.recompute = False
 
     def forward(
         self, video: Stream, tactile: Stream | None, mask: Bool[Tensor, "tokens tokens"]
     ) -> tuple[Stream, Stream | None]:
         """Update both streams through the shared attention."""
-        if self.recompute is None or not torch.is_grad_enabled():
+        if not self.recompute or not torch.is_grad_enabled():
             return self._update(video, tactile, mask)
 
-        def update() -> Streams:
+        def update() -> tuple[Stream, Stream | None]:
             # Keys and values of the text are computed again, too.
             text = None if video.text is None else Text(video.text.words)
             return self._update(replace(video, text=text), tactile, mask)
 
-        updated, touched = self.recompute(update)
+        updated, touched = checkpoint(update, use_reentrant=False, preserve_rng_state=False)
         return replace(updated, text=video.text), touched
 
     def _update(

@@ -93,16 +93,11 @@ class TimeEmbedding(nn.Module):
 
     def forward(self, t: Float32[Tensor, "..."]) -> Float32[Tensor, "*batch width"]:
         """Sines and cosines followed by two layers."""
-        return self.project(time_waves(t, TIME_WIDTH))
-
-
-def time_waves(t: Float32[Tensor, "..."], width: int) -> Float32[Tensor, "*batch waves"]:
-    """Cosines, then sines, of flow times in 0 … 1, at rates from 1 to 1e-4; `width` is even."""
-    half = width // 2
-    steps = torch.arange(half, dtype=torch.float32, device=t.device)
-    rates = torch.exp(-math.log(1e4) * steps / half)
-    angles = t[..., None] * TIME_RANGE * rates
-    return torch.cat([angles.cos(), angles.sin()], dim=-1)
+        half = TIME_WIDTH // 2
+        steps = torch.arange(half, dtype=torch.float32, device=t.device)
+        rates = torch.exp(-math.log(1e4) * steps / half)
+        angles = t[..., None] * TIME_RANGE * rates
+        return self.project(torch.cat([angles.cos(), angles.sin()], dim=-1))
 
 
 @dataclass(frozen=True)

@@ -73,9 +73,7 @@ class WanConfig(FrozenModel):
     """Sizes of the Wan2.2 networks beyond layers, heads and width, which `NetworkConfig` has."""
 
     ffn_width: int = Field(default=14336, ge=1, description="feed-forward width of a layer")
-    time_width: int = Field(
-        default=256, ge=2, multiple_of=2, description="sines and cosines of the time"
-    )
+    time_width: int = Field(default=256, ge=2, description="sines and cosines of the time")
     text_width: int = Field(default=4096, ge=1, description="width of the text features")
     text_tokens: int = Field(default=512, ge=1, description="length that texts are padded to")
     vae_width: int = Field(default=160, ge=1, description="first width of the video encoder")
@@ -95,6 +93,25 @@ class WanConfig(FrozenModel):
         import torch
 
         return torch.float32 if self.precision == "float32" else torch.bfloat16
+
+    def transformer_sizes(
+        self, *, num_layers: int, num_heads: int, head_width: int
+    ) -> dict[str, object]:
+        """Arguments of `diffusers.WanTransformer3DModel`."""
+        return {
+            "patch_size": PATCH,
+            "num_attention_heads": num_heads,
+            "attention_head_dim": head_width,
+            "in_channels": LATENT_CHANNELS,
+            "out_channels": LATENT_CHANNELS,
+            "text_dim": self.text_width,
+            "freq_dim": self.time_width,
+            "ffn_dim": self.ffn_width,
+            "num_layers": num_layers,
+            "cross_attn_norm": True,
+            "qk_norm": "rms_norm_across_heads",
+            "eps": 1e-6,
+        }
 
     def autoencoder_sizes(self) -> dict[str, object]:
         """Arguments of `diffusers.AutoencoderKLWan`."""

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, cast
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float32, UInt8
@@ -131,8 +131,7 @@ class JointWorldModel(nn.Module):
     video_residual_std: Tensor
     tactile_residual_std: Tensor
 
-    def __init__(self, config: NetworkConfig, codec: nn.Module | None = None) -> None:
-        """Network of random or no weights; `codec` takes the place of the configuration's own."""
+    def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
         self.config = config
         # Small parts and those of Wan2.2 have the same methods. The latter are on the meta device
@@ -141,9 +140,9 @@ class JointWorldModel(nn.Module):
         transformer: Any = None
         if wan is not None:
             transformer = empty_transformer(config, wan)
-        if codec is None:
-            codec = VisualCodec(config) if wan is None else WanVideoCodec(wan)
-        self.codec = cast("VisualCodec | WanVideoCodec", codec)
+        self.codec: VisualCodec | WanVideoCodec = (
+            VisualCodec(config) if wan is None else WanVideoCodec(wan)
+        )
         self.tokenizer = build_tokenizer(config).requires_grad_(requires_grad=False)
         self.normalizer = ActionNormalizer()
         self.register_buffer("video_residual_std", torch.ones(()))

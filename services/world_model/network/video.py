@@ -1,9 +1,7 @@
 """The video expert of the joint model, and its conditions: a small one or Wan2.2's."""
 
-import math
-from collections import OrderedDict
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import torch
 from jaxtyping import Bool, Float, Float32
@@ -28,18 +26,16 @@ from services.world_model.network.attention import (
 from services.world_model.network.codecs import Latents, by_latent
 from services.world_model.network.conditioning import (
     ACTION_WIDTH,
+    TIME_RANGE,
     ActionFeatures,
     Condition,
     PastCondition,
     after_first,
-    time_waves,
     without_dropped,
 )
 from services.world_model.network.configuration import (
     FLOAT32_PARTS,
     FRAMES_PER_LATENT,
-    LATENT_CHANNELS,
-    PATCH,
     RASTER_CELLS_PER_TOKEN,
     NetworkConfig,
     WanConfig,
@@ -48,8 +44,9 @@ from services.world_model.network.configuration import (
 from services.world_model.network.inputs import ModelInputs
 from services.world_model.network.instruction import LastUsed, TextFeatures
 
-# Of all norms of Wan2.2.
-_EPS: Final = 1e-6
+if TYPE_CHECKING:
+    from diffusers import WanTransformer3DModel
+
 _ADAPTERS: Final = (".lora_down", ".lora_up")
 _Raster = Float32[Tensor, "batch time 2 cells cells"]
 _PastRaster = Float32[Tensor, "batch past 2 cells cells"]
@@ -172,7 +169,6 @@ class WanVideoCondition(nn.Module):
         super().__init__()
         width = config.video_width
         self.embedder: Any = embedder
-        self.time_width = wan.time_width
         self.actions = two_layers(FRAMES_PER_LATENT * ACTION_WIDTH, width, width)
         self.actions[-1] = zero_linear(width, width)
         self.commanded = nn.Parameter(torch.zeros(width))
@@ -211,7 +207,7 @@ class WanVideoCondition(nn.Module):
 
     def at(self, constants: WanConstants, t: Float32[Tensor, "batch latents"]) -> WanCondition:
         """Conditions at these times; t is zero where tokens are clean."""
-        waves = time_waves(t.flatten(), self.time_width)
+        waves = self.embedder.timesteps_proj(TIME_RANGE * t.flatten())
         time = split_axis(self.embedder.time_embedder(waves), 0, tuple(t.shape)) + constants.actions
         project = self.embedder.time_proj
         modulation = project(functional.silu(time).to(project.weight.dtype)).float()
@@ -289,7 +285,7 @@ class WanBlock(Block):
 class WanVideoExpert(nn.Module):
     """Ends of the transformer: embeds latents and predicts velocities."""
 
-    def __init__(self, config: NetworkConfig, transformer: "WanTransformer") -> None:
+    def __init__(self, config: NetworkConfig, transformer: "WanTransformer3DModel") -> None:
         super().__init__()
         self._side, self._head_width = config.tokens_across, config.head_width
         self._num_views = config.num_views
@@ -334,67 +330,15 @@ class WanVideoExpert(nn.Module):
         return predicted
 
 
-class WanTransformer(nn.Module):
-    """Weights of Wan2.2's transformer, under the names that diffusers' `WanTransformer3DModel` has.
-
-    `WanVideoCondition`, `WanVideoExpert` and `WanBlock` compute with them.
-    """
-
-    def __init__(self, config: NetworkConfig, wan: WanConfig) -> None:
-        super().__init__()
-        width = config.num_heads * config.head_width
-        self.patch_embedding = nn.Conv3d(LATENT_CHANNELS, width, PATCH, stride=PATCH)
-        self.condition_embedder = _named(
-            time_embedder=_named(
-                linear_1=nn.Linear(wan.time_width, width),
-                act=nn.SiLU(),
-                linear_2=nn.Linear(width, width),
-            ),
-            time_proj=nn.Linear(width, NUM_MODULATIONS * width),
-            text_embedder=_named(
-                linear_1=nn.Linear(wan.text_width, width),
-                act_1=nn.GELU("tanh"),
-                linear_2=nn.Linear(width, width),
-            ),
-        )
-        self.blocks = nn.ModuleList(
-            _WanLayer(width, config.num_heads, wan.ffn_width) for _ in range(config.num_layers)
-        )
-        self.norm_out = nn.LayerNorm(width, _EPS, elementwise_affine=False)
-        self.proj_out = nn.Linear(width, math.prod(PATCH) * LATENT_CHANNELS)
-        self.scale_shift_table = nn.Parameter(torch.empty(1, 2, width))
-
-
-class _WanLayer(nn.Module):
-    def __init__(self, width: int, num_heads: int, ffn_width: int) -> None:
-        super().__init__()
-        self.norm1 = nn.LayerNorm(width, _EPS, elementwise_affine=False)
-        self.attn1 = _WanAttention(width, num_heads)
-        self.attn2 = _WanAttention(width, num_heads)
-        self.norm2 = nn.LayerNorm(width, _EPS)
-        first = _named(proj=nn.Linear(width, ffn_width), act=nn.GELU("tanh"))
-        self.ffn = _named(net=nn.Sequential(first, nn.Identity(), nn.Linear(ffn_width, width)))
-        self.norm3 = nn.LayerNorm(width, _EPS, elementwise_affine=False)
-        self.scale_shift_table = nn.Parameter(torch.empty(1, NUM_MODULATIONS, width))
-
-
-class _WanAttention(nn.Module):
-    def __init__(self, width: int, num_heads: int) -> None:
-        super().__init__()
-        self.heads = num_heads
-        self.norm_q, self.norm_k = nn.RMSNorm(width, _EPS), nn.RMSNorm(width, _EPS)
-        self.to_q, self.to_k, self.to_v = (nn.Linear(width, width) for _ in range(3))
-        self.to_out = nn.ModuleList([nn.Linear(width, width)])
-
-
-def _named(**parts: nn.Module) -> nn.Sequential:
-    return nn.Sequential(OrderedDict(parts))
-
-
-def empty_transformer(config: NetworkConfig, wan: WanConfig) -> WanTransformer:
+def empty_transformer(config: NetworkConfig, wan: WanConfig) -> "WanTransformer3DModel":
     """Transformer on the meta device, in the precision of the configuration."""
+    from diffusers import WanTransformer3DModel
+
+    sizes = wan.transformer_sizes(
+        num_layers=config.num_layers, num_heads=config.num_heads, head_width=config.head_width
+    )
     with torch.device("meta"):
-        transformer = WanTransformer(config, wan)
+        transformer = WanTransformer3DModel(**sizes)
     for name, parameter in transformer.named_parameters():
         is_exact = any(part in name for part in FLOAT32_PARTS)
         parameter.data = parameter.data.to(torch.float32 if is_exact else wan.dtype)

@@ -21,7 +21,6 @@ from dextouch.tactile.layout import common_layout
 from services.networks import optimizer
 from services.networks.weight_files import on_device
 from services.world_model import checkpoints
-from services.world_model.network.attention import recomputed
 from services.world_model.network.codecs import to_unit
 from services.world_model.network.configuration import NetworkConfig, WanFiles, num_latents
 from services.world_model.network.inputs import PastRule, build_inputs
@@ -122,7 +121,7 @@ class TrainingRun:
         if settings.freeze_video or (wan is not None and wan.lora_rank):
             freeze_pretrained(model)
         for layer in model.joint_layers():
-            layer.recompute = recomputed if settings.recompute else None
+            layer.recompute = settings.recompute
         self.processes.shard(model, model.layers, whole=(model.codec, model.tokenizer))
 
     def _start_averages(self) -> None:

@@ -5,12 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from services.world_model.network.configuration import (
-    LATENT_CHANNELS,
-    PATCH,
-    NetworkConfig,
-    WanConfig,
-)
+from services.world_model.network.configuration import NetworkConfig, WanConfig
 
 LAYERS, HEADS, HEAD_WIDTH = 2, 2, 12
 
@@ -28,13 +23,8 @@ def transformer(wan_config):
     """Random everywhere; diffusers starts biases and norms at zero and one."""
     from diffusers import WanTransformer3DModel  # seconds, in every process that collects tests
 
-    network = WanTransformer3DModel(
-        patch_size=PATCH, num_attention_heads=HEADS, attention_head_dim=HEAD_WIDTH,
-        in_channels=LATENT_CHANNELS, out_channels=LATENT_CHANNELS, text_dim=wan_config.text_width,
-        freq_dim=wan_config.time_width, ffn_dim=wan_config.ffn_width, num_layers=LAYERS,
-        cross_attn_norm=True, qk_norm="rms_norm_across_heads", eps=1e-6,
-    )  # fmt: skip
-    return shaken(network, seed=0)
+    sizes = wan_config.transformer_sizes(num_layers=LAYERS, num_heads=HEADS, head_width=HEAD_WIDTH)
+    return shaken(WanTransformer3DModel(**sizes), seed=0)
 
 
 @pytest.fixture(scope="session")

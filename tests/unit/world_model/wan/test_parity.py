@@ -22,7 +22,6 @@ from services.world_model.network.video import (
     WanBlock,
     WanVideoCondition,
     WanVideoExpert,
-    empty_transformer,
 )
 
 NO_PAST = torch.zeros(2, 0, 2, 8, 8)
@@ -53,17 +52,15 @@ def tokens_of(latents):
 
 def velocity(config, transformer, latents, t, text):
     """What the joint layers predict without tactile tokens, actions and mask."""
-    own = empty_transformer(config, config.wan)
-    own.load_state_dict(transformer.state_dict(), assign=True)
-    condition = WanVideoCondition(config, config.wan, own.condition_embedder)
-    expert = WanVideoExpert(config, own)
+    condition = WanVideoCondition(config, config.wan, transformer.condition_embedder)
+    expert = WanVideoExpert(config, transformer)
     tokens = tokens_of(latents)
     conditions = condition.at(condition.of(torch.zeros(*t.shape, config.video_width), text), t)
     stream = expert.start(tokens, tokens[:, 0], conditions, torch.zeros(2, 9, 2, 8, 8), NO_PAST)
     width = config.tactile_width
     nothing = Stream(torch.zeros(2, 0, width), torch.zeros(2, 0, 6, width))
     everything = torch.ones(stream.tokens.shape[1], stream.tokens.shape[1], dtype=torch.bool)
-    for block in own.blocks:
+    for block in transformer.blocks:
         layer = JointLayer(WanBlock(block), ExpertBlock(config, config.tactile_width))
         stream, nothing = layer(stream, nothing, everything)
     return expert.finish(stream, conditions)
