@@ -27,8 +27,8 @@ MAX_FOCAL_SIGMA = 0.05
 # Corners that turn between neighbours by more than this share of a square are not of the board: the
 # detector took the rim of the print for one. Boards turned by 60 degrees at 0.3 m reach 0.2.
 MAX_CORNER_SHIFT = 0.4
-# Measured sides of markers are up to 3 % too small where blurred, and up to 15 % where a board fills
-# a wide lens; corners move by more than 0.2 px where the entered size is off by a third.
+# Measured sides of markers are up to 3 % too small where blurred, and up to 15 % where a board
+# fills a wide lens; corners move by more than 0.2 px where the entered size is off by a third.
 MAX_MARKER_ERROR = 0.15
 # Views with residuals above this multiple of the median (and this many pixels) have such corners,
 # which move the focal length by more than its reported sigma: 0.5 % by one corner of 25 views.
