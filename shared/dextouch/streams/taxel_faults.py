@@ -38,7 +38,8 @@ NOISY_TAXELS: Final = 0.5
 # A taxel is deaf that stays the same within noise in almost all of so many windows in which so many
 # of its neighbours moved by more, and in almost all of the take. What is hard has gaps as sharp as
 # that (between two ridges, inside a ring), but its outlines are as sharp: half of the taxels beside
-# it, of whose neighbours fewer moved, stay the same as well. Of what spreads by half a taxel 8 % do.
+# it, of whose neighbours fewer moved, stay the same as well. Of what spreads by half a taxel 8 %
+# do.
 MIN_MOVE_KPA: Final = 5.0
 MAX_SILENT_KPA: Final = 0.5
 NEIGHBOUR_SHARE: Final = 0.75
