@@ -335,6 +335,19 @@ def test_pressures_that_are_all_in_another_unit_are_refused(factor, pressures):
             fit_gain(tare, presses)
 
 
+def test_the_full_scale_of_a_glove_of_few_bits_is_its_own():
+    """12 bits over 1600 kPa, in a layout of 16 bits."""
+    rng = np.random.default_rng(0)
+
+    def counts(kpa):
+        return np.rint(100 + 2.56 * kpa + rng.normal(scale=0.7, size=(600, 360))).astype(np.uint16)
+
+    tare = measure_tare(counts(0.0), side="left")
+    presses = [TaxelPress(p, 0.01 * p, counts(p), EVERYWHERE) for p in (30.0, 60.0, 120.0)]
+    gain = fit_gain(tare, presses, full_scale_counts=4095.0)
+    np.testing.assert_allclose(np.median(gain.gain_counts_per_kpa), 2.56, rtol=0.02)
+
+
 def test_a_pad_that_is_pressed_and_not_named_is_refused():
     """Two fingers share a weight, or another one was pressed than is named."""
     glove = Glove(14)

@@ -229,7 +229,8 @@ def fit_gain(
     state[~pressed & (state == OK)] = UNPROVEN
     state[pressed & (state == UNPROVEN)] = OK
     gain, sigma, zero, excess = _lines(points)
-    _check_range(gain[(state == OK) & (sigma < MAX_RELATIVE_SIGMA * gain)], tare.layout)
+    precise = gain[(state == OK) & (sigma < MAX_RELATIVE_SIGMA * gain)]
+    _check_range(precise, tare.layout, full_scale_counts)
     # How long a touch lasts is not known, hence neither what it has crept: that is an error.
     creep = float(np.median([abs(_creep(press, tare)) for press in presses]))
     sigma = np.hypot(sigma, gain * np.hypot(creep, _trend(points, gain, state == OK)))
@@ -302,10 +303,11 @@ def _check_others(level: Level, press: TaxelPress, tare: TaxelTare) -> None:
         )
 
 
-def _check_range(gain: np.ndarray, layout: TactileLayout) -> None:
+def _check_range(gain: np.ndarray, layout: TactileLayout, full_scale_counts: float) -> None:
     if not len(gain):
         return
-    full_scale_kpa = layout.full_scale / (reading_step(layout) * float(np.median(gain)))
+    # Gains are in the same steps of readings as this full scale, which may be below the layout's.
+    full_scale_kpa = full_scale_counts / float(np.median(gain))
     ratio = full_scale_kpa / layout.range_kpa
     if not 1 / MAX_RANGE_RATIO < ratio < MAX_RANGE_RATIO:
         times = f"{max(ratio, 1 / ratio):.3g} times too {'high' if ratio > 1 else 'low'}"

@@ -13,6 +13,7 @@ import numpy as np
 from dextouch.clients import HttpLink
 from dextouch.errors import NotFoundError, StaleDataError
 from dextouch.geometry import NUM_DISTORTION
+from dextouch.schemas import StationHealth
 from dextouch.tactile.layout import Side, TactileLayout
 from services.alignment.calibration.intrinsics import CameraCalibration, calibrate_found
 from services.alignment.calibration.tactile_gain import GloveCalibration, filled_gain
@@ -304,7 +305,20 @@ def station_arrivals(link: HttpLink, camera: str, *, wait: Wait = time.sleep) ->
 
 
 def wait_for_camera(link: HttpLink, camera: str, *, wait: Wait) -> None:
-    """Wait for the first image of a station's camera; raises NotFoundError: none within 30 s."""
+    """Wait for the first image of a station's camera.
+
+    Raises NotFoundError: none within 30 s, or at once if the station has no such camera.
+    """
+    reply = link.request("GET", "/v1/health")
+    health = StationHealth.model_validate_json(reply.body, extra="ignore")
+    names = [
+        stream.stream.removeprefix("camera_")
+        for stream in health.streams
+        if stream.stream.startswith("camera_")
+    ]
+    if camera not in names:
+        listed = ", ".join(sorted(names)) or "none"
+        raise NotFoundError(f"camera {camera!r}: the station has no such camera; it has: {listed}")
     for _ in range(round(MAX_FIRST_IMAGE_S / LIVE_PERIOD_S)):
         try:
             live_image(link, camera)

@@ -66,7 +66,9 @@ def place_on_grid(
     continued = outside & near & (span <= max_gap_ns)
     # Beyond the ends from the end itself: samples of a burst are closer than they were taken.
     beyond_ns = grid_ns - t_ns[left + (weight == 1)]
-    weight = np.where(continued, weight + beyond_ns / np.maximum(span, period_ns / 2), weight)
+    # A stream may be faster than declared.
+    least_ns = min(period_ns / 2, float(np.median(np.diff(t_ns))))
+    weight = np.where(continued, weight + beyond_ns / np.maximum(span, least_ns), weight)
     return GridPlacement(left, weight, valid | continued)
 
 

@@ -53,7 +53,7 @@ class HandTraces:
     ) -> None:
         """Samples of keypoints (m), of a wrist's poses, or of the pressures (kPa) of a layout.
 
-        Keypoints that are not our 25 say nothing.
+        Keypoints that are not our 25, and wrists that are not single poses, say nothing.
         """
         rows = np.asarray(values, dtype=np.float64)
         if layout is not None:
@@ -63,6 +63,8 @@ class HandTraces:
                 return
             ends = [(chain_indices(chain)[0], chain_indices(chain)[-1]) for chain in CHAINS]
             rows = np.stack([np.linalg.norm(rows[:, b] - rows[:, a], axis=1) for a, b in ends], 1)
+        if name.startswith("wrist") and rows.shape[1:] != (7,):
+            return
         known = np.isfinite(rows).all(axis=1)
         rows = rows[known]
         if name.startswith("wrist") and len(rows):

@@ -35,10 +35,11 @@ MAX_DIPS_SHARE: Final = 0.02
 # Readings that turn back in so many of the samples are noisy, and so many taxels of a noisy glove.
 MIN_NOISE_SHARE: Final = 0.2
 NOISY_TAXELS: Final = 0.5
-# A taxel is deaf that stays the same within noise in almost all windows, although so many of its
-# neighbours moved by more in so many of them. What is hard has gaps as sharp as that (between two
-# ridges, inside a ring), but its outlines are as sharp: half of the taxels beside it, of whose
-# neighbours fewer moved, stay the same as well. Of what spreads by half a taxel 8 % do.
+# A taxel is deaf that stays the same within noise in almost all of so many windows in which so many
+# of its neighbours moved by more, and in almost all of the take. What is hard has gaps as sharp as
+# that (between two ridges, inside a ring), but its outlines are as sharp: half of the taxels beside
+# it, of whose neighbours fewer moved, stay the same as well. Of what spreads by half a taxel 8 %
+# do.
 MIN_MOVE_KPA: Final = 5.0
 MAX_SILENT_KPA: Final = 0.5
 NEIGHBOUR_SHARE: Final = 0.75
@@ -103,9 +104,9 @@ class TaxelFaults:
         self.blocks = TaxelBlocks(
             gain_counts_per_kpa, usable=self._usable, step=step, layout=layout
         )
-        zeros = np.zeros((10, num_taxels))
+        zeros = np.zeros((11, num_taxels))
         self._finite, self._below, self._rest, self._kept, self._longest, self._random = zeros[:6]
-        self._turns, self._dips, self._asked, self._moved = zeros[6:]
+        self._turns, self._dips, self._asked, self._silent, self._moved = zeros[6:]
         self._num_beside = self._num_silent_beside = 0
 
     def add(self, counts: Float64[np.ndarray, "time taxels"]) -> None:
@@ -185,7 +186,9 @@ class TaxelFaults:
         range_kpa = np.ptp(np.nan_to_num(offsets), axis=0) / self._gain
         moved = range_kpa >= MIN_MOVE_KPA
         around = neighbour_share(moved, self._layout)
-        self._asked += around >= NEIGHBOUR_SHARE
+        asked = around >= NEIGHBOUR_SHARE
+        self._asked += asked
+        self._silent += asked & (range_kpa < MAX_SILENT_KPA)
         self._moved += range_kpa >= MAX_SILENT_KPA
         # A taxel that moves alone is no contact.
         around = neighbour_share(moved & (around > 0), self._layout)
@@ -233,6 +236,7 @@ class TaxelFaults:
         is_loose = (self._dips > MAX_DIPS_SHARE * n) & ~is_below
         is_still = self._moved <= (1 - SILENT_SHARE) * self._num_windows
         is_deaf = is_still & (self._asked >= MIN_ASKED)
+        is_deaf &= self._silent >= SILENT_SHARE * self._asked
         is_deaf &= self._num_silent_beside <= MAX_SHARP_SHARE * self._num_beside
         return {
             "absent": 1.0 - self._finite / n > MAX_MISSING,

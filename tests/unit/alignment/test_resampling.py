@@ -53,6 +53,16 @@ def test_samples_that_came_in_a_burst_lead_nowhere_far_at_the_ends(times_ms):
     np.testing.assert_allclose(values, [-before, 3 + after], atol=1e-9)
 
 
+def test_a_stream_that_is_faster_than_declared_goes_on_along_its_line():
+    """Declared 30 Hz, sent each 11 ms, 16 ms beyond the end: 1 + 16 / 11 spans."""
+    t_ns = np.arange(10) * 11 * MS
+    at = place_on_grid(
+        t_ns, t_ns[-1:] + 16 * MS, period_ns=round(1e9 / 30), max_gap_ns=round(2.5e9 / 30)
+    )
+    assert at.valid.all()
+    np.testing.assert_allclose(at.weight, [1 + 16 / 11], atol=1e-12)
+
+
 def test_a_pose_between_two_samples_has_its_share_of_both():
     """From 0 to 1 m and from 0 to 80 degrees about z, at a quarter and at three quarters."""
     half_rad = np.deg2rad(40)

@@ -76,6 +76,13 @@ def test_a_tracker_that_stands_still_while_its_fingers_move(noise_m):
         assert "wrist_left" not in found(streams)
 
 
+def test_wrists_that_are_not_single_poses_say_nothing():
+    traces, t_ns = HandTraces(), np.arange(5)
+    for shape in ((5, 2, 7), (5, 6), (5,)):
+        traces.add("wrist_left", t_ns, np.zeros(shape))
+    assert traces.found() == {}
+
+
 def test_a_tracker_that_stands_still_half_turned():
     """Noise changes the sign of a quaternion whose w is zero."""
     for seed in SEEDS:

@@ -217,6 +217,31 @@ def test_deaf_taxels_among_soft_touches_are_found(kpa, least, capsys):
     assert num_found >= least
 
 
+def three_grasps(deaf=(), *, is_whole_hand=True):
+    """5 min with three soft grasps of 2 s by all taxels, or by the palm and a finger."""
+    calibration, _ = take(0, seconds=1)
+    kpa = np.zeros((300 * 60, 320))
+    touching = slice(0, 320) if is_whole_hand else slice(64, 320)
+    for first in (1800, 7200, 14_400):
+        kpa[first : first + 120, touching] = 15 * np.sin(np.linspace(0, np.pi, 120))[:, None]
+    kpa[:, list(deaf)] = 0.0
+    counts = np.full((len(kpa), 360), 500.0)
+    counts[:, calibration.cells] = calibration.tare_counts + kpa * calibration.gain_counts_per_kpa
+    return found(calibration, np.rint(counts + np.random.default_rng(0).normal(size=counts.shape)))
+
+
+@pytest.mark.parametrize("is_whole_hand", [True, False])
+def test_taxels_that_are_seldom_touched_are_not_deaf(is_whole_hand):
+    assert three_grasps(is_whole_hand=is_whole_hand) == {}
+
+
+@pytest.mark.parametrize("is_whole_hand", [True, False])
+def test_deaf_taxels_of_a_take_with_few_grasps_are_found(is_whole_hand):
+    deaf = [80 + 7 * 16 + 7, 80 + 7 * 16 + 8]
+    named = three_grasps(deaf, is_whole_hand=is_whole_hand)
+    assert {cause: taxels.tolist() for cause, taxels in named.items()} == {"dead": deaf}
+
+
 @pytest.mark.parametrize(
     ("factor", "said"),
     [
