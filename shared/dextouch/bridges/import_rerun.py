@@ -137,8 +137,7 @@ def opened_rrd(path: Path) -> tuple[RrdReader, list[str]]:
             reader = RrdReader(path)
         except (ValueError, RuntimeError, OSError, pa.ArrowException) as error:
             raise CorruptDataError(f"{path}: rerun-sdk cannot read it ({error})") from error
-    own = [str(one.message) for one in said if issubclass(one.category, RerunWarning)]
-    return reader, [text for text in own if "footer" in text]
+    return reader, [str(one.message) for one in said if issubclass(one.category, RerunWarning)]
 
 
 def _timeline(path: Path, name: str | None) -> tuple[str, list[str]]:
