@@ -247,7 +247,8 @@ def test_the_reason_of_a_refusal_fits_its_frame(monkeypatch):
 
     monkeypatch.setattr(app.state.access, "check", refuse)
     client = TestClient(app, base_url="http://localhost")
-    with pytest.raises(WebSocketDisconnect) as caught, client.websocket_connect("/v1/openpi"):
+    url = "ws://localhost/v1/openpi"
+    with pytest.raises(WebSocketDisconnect) as caught, client.websocket_connect(url):
         pass
     assert caught.value.reason == "é" * 61
 
