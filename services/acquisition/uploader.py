@@ -174,11 +174,11 @@ class Uploader:
         done = []
         self._retry_after_s = 0.0
         for path in spooled_takes(self._spool_root):
-            if upload_state(path) != "waiting":
-                continue
             if self._stopping.is_set():
                 break
             try:
+                if upload_state(path) != "waiting":
+                    continue
                 is_done = self._upload_traced(path)
                 if is_done:
                     done.append(path.name)
@@ -192,6 +192,12 @@ class Uploader:
                     asked_s = float(str(error.details["retry_after_s"]))
                     self._retry_after_s = min(asked_s, MAX_RETRY_AFTER_S)
                     break
+            except Exception as error:
+                # A mistake of ours with one take must not keep all others here.
+                text = f"unexpected error ({error!r}); see the service's log"
+                if self._failures.get(path.name, ("", 0))[0] != text:
+                    logger.exception("fail_upload", recording_id=path.name)
+                self._failures[path.name] = (text, 0)
         return done
 
     def _status(self, path: Path, damage: str | None) -> UploadStatus:
@@ -247,10 +253,13 @@ class Uploader:
         problem = ""
         while not self._stopping.is_set():
             try:
-                if self._deleted is not None and self._store is not None:
-                    self._deleted.remove(self._store)
-                self.upload_all()
-                self.retention.sweep()
+                try:
+                    if self._deleted is not None and self._store is not None:
+                        self._deleted.remove(self._store)
+                    self.upload_all()
+                finally:
+                    # Whatever fails, the spool must not fill up.
+                    self.retention.sweep()
                 problem = ""
             except StorageError as error:
                 logger.warning("fail_retention", error=error.message)

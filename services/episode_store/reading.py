@@ -4,12 +4,12 @@ import hashlib
 from collections.abc import Callable, Iterator
 from functools import partial
 from math import prod
-from typing import Annotated, Any
+from typing import Annotated, Any, Final
 
 import numpy as np
 from fastapi import APIRouter, Header, Query, Response
 from jaxtyping import Float64
-from pydantic import BaseModel, Field
+from pydantic import AfterValidator, BaseModel, Field
 
 from dextouch.episodes import (
     EpisodeReader,
@@ -275,8 +275,9 @@ class ImagesQuery(SpanQuery):
 Images = Annotated[ImagesQuery, Query()]
 
 
-# Differences of two fit int64; until the year 2116.
-Nanoseconds = Annotated[int, Field(gt=-(2**62), lt=2**62)]
+# Differences of two fit int64; until the year 2116. Beyond it is "from the start", "to the end".
+_MOST_NS: Final = 2**62 - 1
+Nanoseconds = Annotated[int, AfterValidator(lambda ns: max(-_MOST_NS, min(ns, _MOST_NS)))]
 
 
 class SignalsQuery(FrozenModel):

@@ -13,6 +13,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.types as arrow_types
 from rerun.chunk import Chunk, RrdReader
+from rerun.error_utils import RerunWarning
 
 from dextouch.bridges.import_images import RAW, check_codec, check_pixels
 from dextouch.bridges.import_messages import (
@@ -126,13 +127,17 @@ def _chunks(path: Path) -> Iterator[Chunk]:
 
 
 def opened_rrd(path: Path) -> tuple[RrdReader, list[str]]:
-    """The reader of a file, and its warnings: of a file without a footer, which may be cut."""
+    """The reader of a file, and its warnings of a footer that lacks: the file may be cut.
+
+    Warnings are recorded of the whole process; those of others are none of the file.
+    """
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         try:
-            return RrdReader(path), [str(one.message) for one in said]
+            reader = RrdReader(path)
         except (ValueError, RuntimeError, OSError, pa.ArrowException) as error:
             raise CorruptDataError(f"{path}: rerun-sdk cannot read it ({error})") from error
+    return reader, [str(one.message) for one in said if issubclass(one.category, RerunWarning)]
 
 
 def _timeline(path: Path, name: str | None) -> tuple[str, list[str]]:

@@ -36,7 +36,6 @@ def export_rrd(reader: Reader, path: Path, *, overwrite: bool = False) -> int:
         StorageError: the write failed.
     """
     attributes = reader.attributes
-    advice = "free space and try again"
     with new_file(path, overwrite=overwrite) as path_partial:
         stream = rr.RecordingStream(APPLICATION, recording_id=reader.item_id)
         try:
@@ -56,12 +55,14 @@ def export_rrd(reader: Reader, path: Path, *, overwrite: bool = False) -> int:
             num_samples = sum(_log(stream, reader, d) for d in reader.streams.values())
             stream.flush()
         except RuntimeError as error:
-            raise StorageError(f"write {path}: {error}; {advice}") from error
+            raise StorageError(f"write {path}: {error}") from error
         finally:
             stream.disconnect()
         # What fails while the end is written is only logged.
         if lacks := opened_rrd(path_partial)[1]:
-            raise StorageError(f"write {path}: its end is missing ({lacks[0]}); {advice}")
+            raise StorageError(
+                f"write {path}: its end is missing ({lacks[0]}); free space and try again"
+            )
         return num_samples
 
 

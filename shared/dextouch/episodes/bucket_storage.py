@@ -10,9 +10,9 @@ import builtins
 import shutil
 import threading
 import uuid
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager, nullcontext, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -440,7 +440,44 @@ def sweep_orphans(bucket: Bucket, *, now: datetime | None = None) -> int:
     of the log.
     """
     limit = (datetime.now(UTC) if now is None else now) - ORPHAN_AGE
-    removed, refused = 0, dict[str, str]()
+    removed, refused, is_probed = 0, dict[str, StorageError](), False
+    denial: _DeletionRefusedError | None = None
+    for group, keys in _orphans(bucket, limit):
+        if denial is not None:
+            refused[group] = denial
+            continue
+        try:
+            if not is_probed:
+                # A file that is not there, to be refused before a claim is marked: that would keep
+                # what waits in an outbox from being uploaded ever.
+                with _deleting():
+                    bucket.remove([f"{group}/none"])
+                is_probed = True
+            removed += _remove_orphan(bucket, group, keys)
+        except _DeletionRefusedError as error:
+            refused[group] = denial = error
+        except StorageError as error:
+            refused[group] = error
+    changes = sorted(_announced(bucket), key=lambda facts: facts.modified)
+    try:
+        with _deleting():
+            bucket.remove([facts.key for facts in changes[:-1] if facts.modified < limit])
+    except _DeletionRefusedError as error:
+        refused[CHANGES] = denial = error
+    if refused:
+        remedy = "allow s3:DeleteObject, " if denial is not None else ""
+        logger.warning(
+            "orphans_not_removed",
+            count=len(refused),
+            places=[*refused][:_MAX_PLACES],
+            reason=(denial or next(iter(refused.values()))).message,
+            advice=f"they only take space; {remedy}the next sweep removes them",
+        )
+    return removed
+
+
+def _orphans(bucket: Bucket, limit: datetime) -> Iterator[tuple[str, list[str]]]:
+    """Groups without a commit record, and without a file since the limit, with their files."""
     for kind in KINDS:
         groups: dict[str, list[ObjectFacts]] = {}
         for facts in bucket.list(f"{kind}s"):
@@ -448,39 +485,31 @@ def sweep_orphans(bucket: Bucket, *, now: datetime | None = None) -> int:
         for group, files in groups.items():
             keys = [facts.key for facts in files]
             is_old = max(facts.modified for facts in files) < limit
-            if not is_old or f"{group}/{COMMIT_FILE}" in keys:
-                continue
-            try:
-                removed += _remove_orphan(bucket, group, keys)
-            except StorageError as error:
-                refused[group] = error.message
-    changes = sorted(_announced(bucket), key=lambda facts: facts.modified)
-    try:
-        bucket.remove([facts.key for facts in changes[:-1] if facts.modified < limit])
-    except StorageError as error:
-        refused[CHANGES] = error.message
-    if refused:
-        logger.warning(
-            "orphans_not_removed",
-            count=len(refused),
-            places=[*refused][:_MAX_PLACES],
-            reason=next(iter(refused.values())),
-            advice="they only take space; allow s3:DeleteObject, the next sweep removes them",
-        )
-    return removed
+            if is_old and f"{group}/{COMMIT_FILE}" not in keys:
+                yield group, keys
 
 
 def _remove_orphan(bucket: Bucket, group: str, keys: list[str]) -> bool:
     """Remove a group without a commit record; False if it has one meanwhile."""
-    # A file that is not there, to be refused before the claim is marked: that would keep what waits
-    # in an outbox from being uploaded ever.
-    bucket.remove([f"{group}/none"])
     bucket.put(f"{group}/{CLAIM_FILE}", _DELETING)
     # It may have become active since it was listed.
     if bucket.head(f"{group}/{COMMIT_FILE}") is not None:
         return False
-    _remove_files(bucket, group, keys)
+    with _deleting():
+        _remove_files(bucket, group, keys)
     return True
+
+
+class _DeletionRefusedError(StorageError):
+    """What was to be deleted may not be."""
+
+
+@contextmanager
+def _deleting() -> Iterator[None]:
+    try:
+        yield
+    except StorageError as error:
+        raise _DeletionRefusedError(error.message) from error
 
 
 def _announce(bucket: Bucket, group: str) -> None:

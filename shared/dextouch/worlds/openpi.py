@@ -22,6 +22,7 @@ from dextouch.schemas import (
     validate_fields,
 )
 from dextouch.serving import MAX_WEBSOCKET_BYTES, AccessControl, accept_messages_of, decoded
+from dextouch.serving.guard import close_reason
 from dextouch.streams import pack_openpi, unpack, unpack_openpi
 from dextouch.worlds.records import Answer
 from dextouch.worlds.rollouts import RolloutService
@@ -61,7 +62,7 @@ def openpi_router(service: RolloutService) -> APIRouter:
         try:
             owner = access.check(authorization, SCOPE)
         except DexTouchError as error:
-            await socket.close(_REFUSED, error.message[:120])
+            await socket.close(_REFUSED, close_reason(error.message))
             return
         await socket.accept()
         described = service.worlds()

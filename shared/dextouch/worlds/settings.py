@@ -18,7 +18,7 @@ class RolloutLimits(FrozenModel):
         default=600.0,
         gt=0,
         lt=1e9,
-        description="seconds until an unused rollout expires; every chunk restarts them",
+        description="seconds until an unused rollout expires; every chunk restarts them; below 1e9",
     )
 
 

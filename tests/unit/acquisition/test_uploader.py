@@ -2,10 +2,12 @@ import errno
 import os
 import shutil
 import socket
+import threading
 from datetime import UTC, datetime, timedelta
 
 import numpy as np
 import pytest
+from structlog.testing import capture_logs
 
 from dextouch.clients import EpisodeStoreClient
 from dextouch.episodes.spool import SpoolReader, SpoolWriter
@@ -346,6 +348,39 @@ def test_a_mistake_does_not_end_the_uploads(tmp_path, monkeypatch):
         while not (tmp_path / name / UPLOADED_FILE).exists():
             assert uploader._thread.is_alive()
             uploader._stopping.wait(0.005)
+    uploader.stop()
+
+
+def test_a_mistake_with_one_take_keeps_no_other_here(tmp_path, monkeypatch):
+    for name in ("a", "b"):
+        spool(tmp_path, name)
+    store, create = FakeStore(), FakeStore.create
+
+    def begin(self, attributes):
+        if attributes.recording_id == "a":
+            raise KeyError("offset")
+        return create(self, attributes)
+
+    monkeypatch.setattr(FakeStore, "create", begin)
+    uploader = Uploader(tmp_path, store, period_s=1.0)
+    with capture_logs() as logs:
+        assert uploader.upload_all() == ["b"]
+        assert uploader.upload_all() == []
+    assert [(log["event"], log["recording_id"]) for log in logs if log["log_level"] == "error"] == [
+        ("fail_upload", "a")
+    ]
+    assert "KeyError('offset')" in uploader.status_of("a").error
+    monkeypatch.setattr(FakeStore, "create", create)
+    assert uploader.upload_all() == ["a"]
+    assert uploader.status_of("a").error is None
+
+
+def test_space_is_made_though_the_uploads_fail(tmp_path, monkeypatch):
+    uploader, swept = Uploader(tmp_path, FakeStore(), period_s=0.01), threading.Event()
+    monkeypatch.setattr(uploader, "upload_all", lambda: 1 / 0)
+    monkeypatch.setattr(uploader.retention, "sweep", swept.set)
+    uploader.start()
+    assert swept.wait(10)
     uploader.stop()
 
 

@@ -362,6 +362,41 @@ def test_a_sweep_goes_on_where_deletions_are_refused(
     assert list(bucket.list("episodes/dead")) == []
 
 
+def orphans(bucket, *names):
+    for name in names:
+        bucket.put(f"episodes/{name}/zarr.json", b"x")
+    return {"now": datetime.now(UTC) + ORPHAN_AGE + timedelta(minutes=1)}
+
+
+def test_a_sweep_asks_once_whether_it_may_delete(bucket, s3_server, tmp_path, monkeypatch):
+    late, asked, remove = orphans(bucket, "a", "b", "c"), [], Bucket.remove
+
+    def noted(self, keys):
+        asked.extend(key for key in keys if key.endswith("/none"))
+        remove(self, keys)
+
+    monkeypatch.setattr(Bucket, "remove", noted)
+    with s3_server.refusing_deletions(f"unit/{tmp_path.name}"), capture_logs() as logs:
+        assert sweep_orphans(bucket, **late) == 0
+    assert len(asked) == 1
+    assert logs[0]["count"] == 3
+    assert sweep_orphans(bucket, **late) == 3
+    assert len(asked) == 2
+
+
+def test_a_sweep_that_may_not_write_asks_for_no_deletions(bucket, monkeypatch):
+    late = orphans(bucket, "a")
+
+    def refuse(*_args, **_more):
+        raise StorageError("write: refused (AccessDenied)")
+
+    monkeypatch.setattr(Bucket, "put", refuse)
+    with capture_logs() as logs:
+        assert sweep_orphans(bucket, **late) == 0
+    assert logs[0]["reason"] == "write: refused (AccessDenied)"
+    assert "s3:DeleteObject" not in logs[0]["advice"]
+
+
 @pytest.mark.long
 def test_equal_content_of_two_writers_is_no_conflict_in_the_bucket(store, bucket, url, tmp_path):
     made = episode_of()

@@ -458,3 +458,11 @@ def test_a_trimmed_recording_has_its_samples_as_they_were(store):
     for span in [(4.0, None), (1.0, 1.0), (-1.0, 1.0)]:
         with pytest.raises(InvalidInputError, match="expected one within 0 … "):
             trim_recording(store, "take", *span)
+
+
+@pytest.mark.parametrize("changes", [{"keep": "yes"}, {"outcome": "failure"}])
+def test_only_texts_of_three_attributes_are_relabelled(store, changes):
+    write_episode(store, "a")
+    with pytest.raises(InvalidInputError, match="expected texts of task, instruction or operator"):
+        relabel_item(store, "a", changes)
+    assert store.list() == ["a"]

@@ -77,6 +77,7 @@ class EditOptions:
 
 
 DEFAULTS = EditOptions()
+_RELABELLED = ("task", "instruction", "operator")
 
 
 @dataclass
@@ -326,6 +327,11 @@ def relabel_item(
         InvalidInputError: nothing changes, a value is invalid, or the outcome is lacking.
         NotFoundError, CorruptDataError, ConflictError, UnavailableError: as `trim_episode`.
     """
+    if any(key not in _RELABELLED or text is None for key, text in changes.items()):
+        raise InvalidInputError(
+            f"relabel {kind} {item_id!r}: got {dict(changes)}, expected texts of task, instruction "
+            "or operator"
+        )
     try:
         RelabelItems.model_validate({"items": [{"kind": kind, "id": item_id}], **changes})
     except ValidationError as error:

@@ -1,6 +1,7 @@
 """Inspection of a store for damage, and repair from a copy or by salvage of what is whole."""
 
 import json
+import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -404,16 +405,21 @@ def _supersede_sources(root: Path, attributes: Attributes, new_id: str) -> None:
 def _changed(
     attributes: Attributes, streams: Sequence[SalvagedStream], lost: Mapping[str, int]
 ) -> dict[str, object]:
-    """Milestones from the first step left, and where dropped samples are counted.
+    """Milestones within the steps left, from their first, and where dropped samples are counted.
 
     They are in the quality of an episode and in the ledger of a take.
     """
     if isinstance(attributes, EpisodeAttributes):
         figures = {f"{name}_{LOST}": float(count) for name, count in lost.items()}
         steps = next((one.kept for one in streams if one.descriptor.name == "action"), None)
-        first_s = 0.0 if steps is None else int(steps.argmax()) / attributes.model_rate_hz
+        first_s, last_s = 0.0, math.inf
+        if steps is not None:
+            kept = np.flatnonzero(steps)
+            first_s, last_s = (int(kept[end]) / attributes.model_rate_hz for end in (0, -1))
         times_s = {
-            name: t - first_s for name, t in attributes.event_times_s.items() if t >= first_s
+            name: t - first_s
+            for name, t in attributes.event_times_s.items()
+            if first_s <= t <= last_s
         }
         return {"quality": attributes.quality | figures, "event_times_s": times_s}
     entries = (LedgerEntry(stream=name, event=LOST, count=count) for name, count in lost.items())
