@@ -24,7 +24,7 @@ from dextouch.tracing import current_trace_id
 from services.acquisition.clock import StationClock
 from services.acquisition.drivers.base import Driver
 from services.acquisition.health.monitor import HealthMonitor
-from services.acquisition.retention import remove_take
+from services.acquisition.retention import discard_take
 from services.acquisition.settings import SpoolSafety
 from services.acquisition.take import (
     DeviceEvents,
@@ -311,7 +311,7 @@ class Recorder:
         take.release()
         self._note_end(take)
         if take.spool.path.exists():
-            remove_take(take.spool.path)
+            discard_take(take.spool.path)
         logger.info("discard_take", recording_id=self._discarded_id)
         give_back_free_memory()
 

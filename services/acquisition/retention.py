@@ -128,6 +128,14 @@ def remove_take(path: Path) -> None:
         shutil.rmtree(grave, onerror=_unless_gone)
 
 
+def discard_take(path: Path) -> None:
+    """As `remove_take`, with nothing left in the spool."""
+    remove_take(path)
+    # Another process may be removing a take.
+    with suppress(OSError):
+        (path.parent / _REMOVED).rmdir()
+
+
 def _unless_gone(_: object, __: object, problem: tuple[Any, BaseException, Any]) -> None:
     """For removals of what recorder and uploader may remove at the same time."""
     if not isinstance(problem[1], FileNotFoundError):

@@ -307,7 +307,8 @@ def _check_range(gain: np.ndarray, layout: TactileLayout, full_scale_counts: flo
     if not len(gain):
         return
     # Gains are in the same steps of readings as this full scale, which may be below the layout's.
-    full_scale_kpa = full_scale_counts / float(np.median(gain))
+    highest = min(full_scale_counts, layout.full_scale / reading_step(layout))
+    full_scale_kpa = highest / float(np.median(gain))
     ratio = full_scale_kpa / layout.range_kpa
     if not 1 / MAX_RANGE_RATIO < ratio < MAX_RANGE_RATIO:
         times = f"{max(ratio, 1 / ratio):.3g} times too {'high' if ratio > 1 else 'low'}"

@@ -65,7 +65,7 @@ def test_discard_may_be_repeated(recorder):
     recorder.arm(PROMPT)
     recorder.record("a")
     assert recorder.discard("a") == recorder.discard("a")
-    assert [path.name for path in recorder.spool_root.rglob("*")] == [".removed"]
+    assert list(recorder.spool_root.iterdir()) == []
 
 
 @pytest.mark.long
@@ -76,7 +76,7 @@ def test_rerecord_arms_the_same_prompt(recorder):
     status = recorder.rerecord("a")
     assert (status.state, status.prompt, status.recording_id) == ("armed", PROMPT, None)
     assert recorder.rerecord("a") == status
-    assert [path.name for path in recorder.spool_root.rglob("*")] == [".removed"]
+    assert list(recorder.spool_root.iterdir()) == []
     assert recorder.record("b").prompt == PROMPT
     recorder.stop("b")
     recorder.save(how("b"))
