@@ -49,7 +49,8 @@ def imagine_episode(
     shorter.
 
     Returns its id; equal source and world give an equal id, and an existing episode is kept. Raises
-    UnknownNameError for no such world, or a source without head camera.
+    UnknownNameError for no such world, or a source without head camera, and InvalidInputError for a
+    source with other steps a second than the world.
     """
     described = {description.name: description for description in client.worlds()}
     if world not in described:
@@ -92,6 +93,7 @@ def _played(
 ) -> tuple[list[Observation], Float64[np.ndarray, "3 3"], Float64[np.ndarray, "steps 67"]]:
     """Observations of the world for an episode's actions, its camera, and these actions."""
     attributes, grid = source.attributes, EpisodeGrid(source)
+    world.check_rate(attributes.model_rate_hz, of=f"episode {attributes.episode_id!r}")
     actions = grid.sent[: whole_steps(len(grid), world.chunk_multiple)]
     with client.start(
         world=world.name,

@@ -2,7 +2,6 @@
 
 import ctypes
 import gc
-import shutil
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
@@ -25,6 +24,7 @@ from dextouch.tracing import current_trace_id
 from services.acquisition.clock import StationClock
 from services.acquisition.drivers.base import Driver
 from services.acquisition.health.monitor import HealthMonitor
+from services.acquisition.retention import discard_take
 from services.acquisition.settings import SpoolSafety
 from services.acquisition.take import (
     DeviceEvents,
@@ -305,11 +305,13 @@ class Recorder:
         take = self.take
         if take is None:
             return
+        # Where the disk is gone, the take would come back with it.
+        self.spool_folder.check(writing=True)
         self._discarded_id = take.spool.attributes.recording_id
         take.release()
         self._note_end(take)
-        with disk_errors(f"discard take {self._discarded_id!r}"):
-            shutil.rmtree(take.spool.path)
+        if take.spool.path.exists():
+            discard_take(take.spool.path)
         logger.info("discard_take", recording_id=self._discarded_id)
         give_back_free_memory()
 

@@ -12,7 +12,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import structlog
 from pydantic import ValidationError
@@ -92,11 +92,11 @@ class SpoolRetention:
 def acknowledgement(path: Path) -> schemas.RecordingStatus | None:
     """What the store answered when it had all of a take; None where it has not, as far as known.
 
-    A note that is damaged or says otherwise does not count: the take is sent again.
+    A note that is damaged, cannot be read or says otherwise does not count: the take is sent again.
     """
     try:
         note = schemas.RecordingStatus.model_validate_json((path / UPLOADED_FILE).read_bytes())
-    except (ValidationError, FileNotFoundError):
+    except (ValidationError, OSError):
         return None
     return note if note.state == "finished" else None
 
@@ -125,7 +125,21 @@ def remove_take(path: Path) -> None:
         grave.parent.mkdir(exist_ok=True)
         shutil.rmtree(grave, ignore_errors=True)
         path.rename(grave)
-        shutil.rmtree(grave)
+        shutil.rmtree(grave, onerror=_unless_gone)
+
+
+def discard_take(path: Path) -> None:
+    """As `remove_take`, with nothing left in the spool."""
+    remove_take(path)
+    # Another process may be removing a take.
+    with suppress(OSError):
+        (path.parent / _REMOVED).rmdir()
+
+
+def _unless_gone(_: object, __: object, problem: tuple[Any, BaseException, Any]) -> None:
+    """For removals of what recorder and uploader may remove at the same time."""
+    if not isinstance(problem[1], FileNotFoundError):
+        raise problem[1]
 
 
 def empty_removed(spool_root: Path) -> None:
@@ -134,7 +148,7 @@ def empty_removed(spool_root: Path) -> None:
     if folder.is_dir():
         with disk_errors(f"empty {folder}"):
             for path in folder.iterdir():
-                shutil.rmtree(path)
+                shutil.rmtree(path, onerror=_unless_gone)
 
 
 @dataclass(frozen=True)

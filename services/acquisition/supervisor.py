@@ -10,7 +10,7 @@ import numpy as np
 import structlog
 from jaxtyping import UInt16
 
-from dextouch.errors import DeviceError
+from dextouch.errors import DeviceError, PacketError
 from dextouch.schemas import SharedLink
 from dextouch.streams import Sample
 from services.acquisition.clock import StationClock, Waiter
@@ -141,15 +141,18 @@ class DeviceSupervisor:
         while not self._stopping.is_set():
             try:
                 self._read_until_lost()
-            except DeviceError as error:
+            except (DeviceError, PacketError) as error:
                 self.last_error = error.message
                 self._count_loss(error)
-                self._log_loss(error.message)
+                if count := self._count_to_log(error.message):
+                    about = {"device": self.driver.name, "error": error.message}
+                    logger.warning("lose_device", **about, count=count)
                 self._close_and_wait()
             except Exception as error:
                 self._events["driver_failure"] += 1
                 self.last_error = f"{type(error).__name__}: {error}"
-                logger.exception("fail_device", device=self.driver.name)
+                if count := self._count_to_log(self.last_error):
+                    logger.exception("fail_device", device=self.driver.name, count=count)
                 self._close_and_wait()
         self.driver.close()
         self.connected.clear()
@@ -172,7 +175,7 @@ class DeviceSupervisor:
                 self.count(readings)
                 self._sink(readings)
 
-    def _count_loss(self, error: DeviceError) -> None:
+    def _count_loss(self, error: DeviceError | PacketError) -> None:
         event = error.details.get("event")
         if isinstance(event, str) and event in self._events:
             self._events[event] += 1
@@ -180,16 +183,16 @@ class DeviceSupervisor:
             # Failing to open a device that is gone is no further loss.
             self._events["lost_device"] += 1
 
-    def _log_loss(self, message: str) -> None:
-        """Log new problems at once, and continuing ones once a minute."""
+    def _count_to_log(self, message: str) -> int:
+        """How often a problem came: a new one at once, a continuing one once a minute, else 0."""
         now_ns = self._clock.now_ns()
         last_message, logged_ns, count = self._logged
         if message == last_message and now_ns - logged_ns < LOG_AGAIN_NS:
             self._logged = (message, logged_ns, count + 1)
-            return
+            return 0
         count = count + 1 if message == last_message else 1
         self._logged = (message, now_ns, count)
-        logger.warning("lose_device", device=self.driver.name, error=message, count=count)
+        return count
 
     def _close_and_wait(self) -> None:
         # The waiter comes before the closing and goes after the next opening, so that a virtual

@@ -82,7 +82,8 @@ class HandleTransport(ABC, Generic[Handle]):
         self.close()
         try:
             self._handle = self._connect()
-        except OSError as error:
+        # The latter of a host that has no possible name.
+        except (OSError, UnicodeError) as error:
             raise DeviceError(f"{self.info}: cannot be opened ({error}); {self.advice}") from error
 
     def read(self) -> bytes:

@@ -42,6 +42,7 @@ from services.acquisition.retention import (
     DeletedTakes,
     SpoolRetention,
     acknowledgement,
+    empty_removed,
     remove_take,
     spooled_takes,
     upload_state,
@@ -54,6 +55,8 @@ logger = structlog.get_logger(__name__)
 DAMAGED_FILE = "damaged.txt"
 # A refusal may be a passing one (an upload that expired in between), but not so often in a row.
 MAX_REFUSALS = 3
+# Chosen: of a proxy that says longer, the store may be back sooner.
+MAX_RETRY_AFTER_S = 3600.0
 REFUSALS = (ConflictError, InvalidInputError, LimitExceededError)
 MAX_ID_CHARACTERS = 128
 NO_STORE = "no episode_store_url is set: takes stay in the spool"
@@ -171,11 +174,11 @@ class Uploader:
         done = []
         self._retry_after_s = 0.0
         for path in spooled_takes(self._spool_root):
-            if upload_state(path) != "waiting":
-                continue
             if self._stopping.is_set():
                 break
             try:
+                if upload_state(path) != "waiting":
+                    continue
                 is_done = self._upload_traced(path)
                 if is_done:
                     done.append(path.name)
@@ -186,8 +189,15 @@ class Uploader:
                     continue
                 self._note_failure(path, error)
                 if "retry_after_s" in error.details:
-                    self._retry_after_s = float(str(error.details["retry_after_s"]))
+                    asked_s = float(str(error.details["retry_after_s"]))
+                    self._retry_after_s = min(asked_s, MAX_RETRY_AFTER_S)
                     break
+            except Exception as error:
+                # A mistake of ours with one take must not keep all others here.
+                text = f"unexpected error ({error!r}); see the service's log"
+                if self._failures.get(path.name, ("", 0))[0] != text:
+                    logger.exception("fail_upload", recording_id=path.name)
+                self._failures[path.name] = (text, 0)
         return done
 
     def _status(self, path: Path, damage: str | None) -> UploadStatus:
@@ -240,14 +250,24 @@ class Uploader:
         logger.error("set_take_aside", recording_id=name, error=error.message)
 
     def _run(self) -> None:
+        problem = ""
         while not self._stopping.is_set():
-            if self._deleted is not None and self._store is not None:
-                self._deleted.remove(self._store)
-            self.upload_all()
             try:
-                self.retention.sweep()
+                try:
+                    if self._deleted is not None and self._store is not None:
+                        self._deleted.remove(self._store)
+                    self.upload_all()
+                finally:
+                    # Whatever fails, the spool must not fill up.
+                    self.retention.sweep()
+                problem = ""
             except StorageError as error:
                 logger.warning("fail_retention", error=error.message)
+            except Exception as error:
+                # A mistake of ours, or a file that cannot be read, must not end uploads for good.
+                if repr(error) != problem:
+                    logger.exception("fail_uploads")
+                problem = repr(error)
             self._stopping.wait(max(self._period_s, self._retry_after_s))
 
     def _upload_traced(self, path: Path) -> bool:
@@ -352,9 +372,14 @@ def recover_spool(spool_root: Path) -> list[str]:
 
     Every acknowledged sample is kept and the recording's ledger says `interrupted`, and what was
     cut off the log. A take that never had a sample is removed; one that another process is writing
-    is left alone, and so is a damaged one, with the reason in its folder.
+    is left alone, and so is a damaged one, with the reason in its folder. Removals that were
+    interrupted are completed.
     """
     recovered = []
+    try:
+        empty_removed(spool_root)
+    except StorageError as error:
+        logger.warning("fail_retention", error=error.message)
     for path in spooled_takes(spool_root):
         try:
             if not SpoolReader(path).closed and _recover(path):

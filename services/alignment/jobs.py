@@ -32,7 +32,7 @@ from services.alignment.synchronization.episode_builder import (
 logger = structlog.get_logger(__name__)
 
 # Raised whenever alignment gives other numbers for the same recording and options.
-ALIGNMENT_VERSION = 6
+ALIGNMENT_VERSION = 7
 MAX_STEM = 100
 # Refused recordings that a message lists; its details have all.
 MAX_LISTED = 5

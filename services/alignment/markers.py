@@ -127,11 +127,13 @@ class MarkerTracker:
     def add(
         self,
         t_ns: int,
-        image: UInt8[np.ndarray, "h w 3"],
+        image: UInt8[np.ndarray, "h w *c"],
         T_world_camera: Float64[np.ndarray, "4 4"],
     ) -> None:
         """Look for the objects in one more image; images come in the order of their times."""
-        found = self._markers.find(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
+        gray = image.reshape(*image.shape[:2], -1)
+        gray = gray[..., 0] if gray.shape[2] == 1 else cv2.cvtColor(gray, cv2.COLOR_RGB2GRAY)
+        found = self._markers.find(gray)
         for one in self._objects:
             candidates = list(self._candidates(one, found))
             if candidates:

@@ -88,8 +88,15 @@ def _export_lerobot(readers: Iterator[EpisodeReader], options: argparse.Namespac
             "frames than the data set has room for",
             file=sys.stderr,
         )
+    if done.cameras_left_out:
+        print(
+            f"cameras without colours are left out: {', '.join(done.cameras_left_out)}; an export "
+            "as MCAP has them",
+            file=sys.stderr,
+        )
     return {
         "num_steps": done.num_frames,
+        "cameras_left_out": list(done.cameras_left_out),
         "present": list(done.present),
         "num_touch_left_out": done.num_touch_left_out,
     }

@@ -5,7 +5,6 @@ from collections.abc import Awaitable, Callable, Sequence
 from contextlib import suppress
 from functools import partial
 from typing import Annotated, Any, Final
-from urllib.parse import quote
 
 from fastapi import (
     APIRouter,
@@ -23,7 +22,6 @@ from fastapi.security import APIKeyCookie
 from pydantic import Field, ValidationError
 from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import QueryParams
-from starlette.websockets import WebSocketState
 
 from dextouch.errors import AccessDeniedError, NotFoundError
 from dextouch.frozen_model import FrozenModel
@@ -44,7 +42,7 @@ from services.dashboard.pages import COOKIE, Sessions
 from services.dashboard.settings import DashboardSettings
 from services.dashboard.station_view import RecorderView
 from services.dashboard.system import System, SystemView
-from services.dashboard.upstream import FORWARDED, Forwarded, Upstream
+from services.dashboard.upstream import FORWARDED, Forwarded, Upstream, path_part
 
 WEBSOCKET_REFUSED = 1008
 # Interval at which a WebSocket checks that its session is still valid.
@@ -116,7 +114,7 @@ def api_router(settings: DashboardSettings, fleet: Fleet, sessions: Sessions) ->
     @router.post("/uploads/{recording_id}/retry", status_code=204)
     async def retry_upload(recording_id: str, feeds: Station) -> None:
         """Upload a refused take again."""
-        path = f"/v1/uploads/{quote(recording_id, safe='')}/retry"
+        path = f"/v1/uploads/{path_part(recording_id)}/retry"
         await feeds.upstream("acquisition").send("POST", path)
 
     @router.get(
@@ -217,16 +215,15 @@ def live_router(fleet: Fleet, finders: Sequence[TopicFinder], sessions: Sessions
         session = asyncio.create_task(_close_with_session(websocket, sessions))
         senders: dict[str, asyncio.Task[None]] = {}
         try:
-            with suppress(WebSocketDisconnect):
-                while websocket.application_state is WebSocketState.CONNECTED:
-                    names = _view(await websocket.receive_text())
-                    found = [(name, _topic(name, known)) for name in names]
-                    wanted = {name: topic for name, topic in found if topic is not None}
-                    for name in senders.keys() - wanted.keys():
-                        senders.pop(name).cancel()
-                    for name in wanted.keys() - senders.keys():
-                        sending = _send(websocket, wanted[name], sessions)
-                        senders[name] = asyncio.create_task(sending)
+            while (message := await websocket.receive())["type"] == "websocket.receive":
+                names = _view(message.get("text") or "")
+                found = [(name, _topic(name, known)) for name in names]
+                wanted = {name: topic for name, topic in found if topic is not None}
+                for name in senders.keys() - wanted.keys():
+                    senders.pop(name).cancel()
+                for name in wanted.keys() - senders.keys():
+                    sending = _send(websocket, wanted[name], sessions)
+                    senders[name] = asyncio.create_task(sending)
         finally:
             tasks = (session, *senders.values())
             for task in tasks:
@@ -290,7 +287,7 @@ def _forwarder(
 ) -> Callable[[Request], Awaitable[Response]]:
     async def forward(request: Request) -> Response:
         sessions.require(request, route.scope)
-        names = {name: quote(value, safe="") for name, value in request.path_params.items()}
+        names = {name: path_part(value) for name, value in request.path_params.items()}
         path = f"/v1{route.path}".format(**names)
         query, feeds = request.query_params, fleet.of()
         if route.service == "acquisition":

@@ -6,12 +6,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from http import HTTPStatus
 from typing import Any, Final, TypeVar
+from urllib.parse import quote
 
 import httpx
 from prometheus_client import Histogram
 from pydantic import SecretStr, TypeAdapter, ValidationError
 
-from dextouch.errors import UnavailableError
+from dextouch.clients.http_link import service_address
+from dextouch.errors import InvalidInputError, NotFoundError, UnavailableError
 from dextouch.schemas import Problem, error_from_problem, first_problems
 from dextouch.tracing import trace_headers
 
@@ -48,8 +50,13 @@ class Upstream:
 
     @staticmethod
     def connect(name: str, url: str, *, key: SecretStr | None, timeout_s: float) -> "Upstream":
-        """Create a client with a bounded connection pool, without sending a request."""
-        headers = {"authorization": f"Bearer {key.get_secret_value()}"} if key else {}
+        """Create a client with a bounded connection pool, without sending a request.
+
+        Raises:
+            InvalidInputError: a URL that is none.
+        """
+        service_address(url, what=name)
+        headers = {"authorization": f"Bearer {key.get_secret_value().strip()}"} if key else {}
         limits = httpx.Limits(max_connections=8, max_keepalive_connections=4)
         client = httpx.AsyncClient(
             base_url=url,
@@ -103,17 +110,22 @@ class Upstream:
         caller closes it.
 
         Raises:
+            InvalidInputError: a body that is no JSON, or a header or query that cannot be sent.
             UnavailableError: no response, or a refusal without a reason.
             DexTouchError: a refusal of the service, as its own class.
         """
         given = {"content": body or None} if isinstance(body, bytes) else {"json": body}
-        request = self._client.build_request(
-            method,
-            path,
-            headers={**(headers or {}), **trace_headers()},
-            **given,
-            timeout=httpx.USE_CLIENT_DEFAULT if timeout_s is None else timeout_s,
-        )
+        try:
+            request = self._client.build_request(
+                method,
+                path,
+                headers={**(headers or {}), **trace_headers()},
+                **given,
+                timeout=httpx.USE_CLIENT_DEFAULT if timeout_s is None else timeout_s,
+            )
+        except (ValueError, httpx.InvalidURL) as error:
+            where = f"{self.name}: {method} {path.partition('?')[0]}"
+            raise InvalidInputError(f"{where}: cannot be sent ({error})") from error
         path = request.url.path
         began_s = time.perf_counter()
         outcome = "failed"
@@ -170,6 +182,13 @@ class Upstream:
     async def close(self) -> None:
         """Close the connections."""
         await self._client.aclose()
+
+
+def path_part(name: str) -> str:
+    """A name from outside as one part of a path; raises NotFoundError if it leads to another."""
+    if name in {".", ".."}:
+        raise NotFoundError(f"got {name!r} in a path, expected the name of an item")
+    return quote(name, safe="")
 
 
 @dataclass(frozen=True)

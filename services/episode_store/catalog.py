@@ -14,6 +14,7 @@ import numpy as np
 from dextouch import schemas
 from dextouch.episodes import EpisodeStore, Kind
 from dextouch.errors import NotFoundError
+from services.episode_store.catalog_file import HALF_HOUR_US
 from services.episode_store.catalog_index import CatalogIndex, Progress
 from services.episode_store.filters import (
     EARLIEST,
@@ -57,6 +58,8 @@ Found = tuple[int, int | None]
 Name = tuple[str, str]
 _KEYS: Final = {"id": "''"} | {name: key.format("i.") for name, key in SORT_COLUMNS.items()}
 _BEYOND_LIMIT: Final = number_key(WEIGHTS["beyond_limit"])
+# As rows of a table of sums.
+_EPISODES: Final = "(SELECT *, 1 AS num, duration_s * 1e9 AS duration_ns FROM item)"
 _BODIES: Final = """SELECT i.row, i.kind, i.stands, i.is_compared, b.item, b.review, g.spread
   FROM item i JOIN body b USING (row) JOIN grp g ON g.number = i.grp
   WHERE i.row IN (SELECT value FROM json_each(?))"""
@@ -240,14 +243,17 @@ class Catalog:
 
     def hours_by(self, field: HoursField, query: HoursFilter) -> schemas.HoursByField:
         """Total duration of matching episodes by the values of a field, and by their reviews."""
-        column = f"i.{field}"
+        column, table = f"i.{field}", "tally"
         if field == "day":
             # Days since the year 1, which are never negative.
-            first_us = query.utc_offset_min * 60 * 10**6 - microseconds(EARLIEST)
-            column = f"(i.at_us + {first_us}) / {DAY_US}"
+            offset_us = query.utc_offset_min * 60 * 10**6
+            column = f"(i.at_us + {offset_us - microseconds(EARLIEST)}) / {DAY_US}"
+            table = _EPISODES if offset_us % HALF_HOUR_US else "half_hours"
+        columns = "sum(i.num), sum(i.duration_ns)"
         found: defaultdict[Any, dict[str | None, tuple[int, float]]] = defaultdict(dict)
-        sums = self._sums((column, "i.verdict"), "sum(i.num), sum(i.duration_ns)", query)
-        for value, verdict, count, duration_ns in sums:
+        for value, verdict, count, duration_ns in self._sums(
+            (column, "i.verdict"), columns, query, table
+        ):
             found[value][verdict] = count, duration_ns / HOUR_NS
         rows = []
         # SQLite sorts episodes without a value first.
@@ -263,14 +269,16 @@ class Catalog:
             rows.append(row)
         return schemas.HoursByField(rows=tuple(rows))
 
-    def _sums(self, by: Sequence[str], columns: str, query: EpisodeFilter) -> list[tuple[Any, ...]]:
-        """Sums over matching episodes by values, in their order."""
+    def _sums(
+        self, by: Sequence[str], columns: str, query: EpisodeFilter, table: str = "tally"
+    ) -> list[tuple[Any, ...]]:
+        """Sums over matching episodes by values, in their order; from `table` if it can tell."""
         where = Condition(terms=["i.kind = 'episode'"])
         query.restrict(where)
-        names, rows = ", ".join(by), "tally"
-        if not where.is_counted or "i.at_us" in names:
-            rows = "(SELECT *, 1 AS num, duration_s * 1e9 AS duration_ns FROM item)"
-        text = f"SELECT {names}, {columns} FROM {rows} i WHERE {where.sql} "
+        names, is_filtered = ", ".join(by), len(where.terms) > 1
+        if not where.is_counted or (table == "half_hours" and is_filtered):
+            table = _EPISODES
+        text = f"SELECT {names}, {columns} FROM {table} i WHERE {where.sql} "
         text += f"GROUP BY {names} ORDER BY {names}"
         return self.index.read(lambda connection: connection.execute(text, where.values).fetchall())
 

@@ -14,12 +14,18 @@ from typing import Final
 import structlog
 
 from dextouch.episodes import CATALOG_FOLDER, held_folder, remove_catalog
-from services.episode_store.filters import COUNTED_ATTRIBUTES, NO_WEIGHT, SORT_COLUMNS
+from services.episode_store.filters import (
+    COUNTED_ATTRIBUTES,
+    EARLIEST,
+    NO_WEIGHT,
+    SORT_COLUMNS,
+    microseconds,
+)
 
 logger = structlog.get_logger(__name__)
 
 # To be incremented with any change of the tables, or of what is read of an item.
-VERSION: Final = 4
+VERSION: Final = 5
 # How long a process waits for another one that writes: longer than linking 100,000 items takes.
 BUSY_S: Final = 30.0
 _DAMAGED: Final = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
@@ -35,22 +41,35 @@ _INDEXES: Final = "".join(
     f"CREATE INDEX take_{name} ON item({key}, name) WHERE is_take;"
     for name, key in ((name, column.format("")) for name, column in SORT_COLUMNS.items())
 )
-# What lists without other conditions are counted by, and hours are summed by.
 _COUNTED: Final = ("kind", "is_take", *COUNTED_ATTRIBUTES, "verdict", "take_verdict")
 _ATTRIBUTE_COLUMNS: Final = ", ".join(f"{name} {kind}" for name, kind in COUNTED_ATTRIBUTES.items())
+# Days begin with one of these in most time zones. They are counted from the year 1: SQLite rounds
+# negative quotients up.
+HALF_HOUR_US: Final = 1800 * 10**6
+_HALF_HOUR: Final = "({{0}}.at_us - {0}) / {1} * {1} + {0}".format(
+    microseconds(EARLIEST), HALF_HOUR_US
+)
+# Tables of sums by columns of `item`: what lists without other conditions are counted by and hours
+# are summed by, and by what hours of days are.
+_SUMS: Final = {
+    "tally": {name: f"{{0}}.{name}" for name in _COUNTED},
+    "half_hours": {"kind": "{0}.kind", "at_us": _HALF_HOUR, "verdict": "{0}.verdict"},
+}
 
 
 def _count(row: str, sign: str) -> str:
     """Statements of a trigger that add a row of `item` to its sums, or take it away."""
-    names = ", ".join(_COUNTED)
-    values = ", ".join(f"{row}.{name}" for name in _COUNTED)
-    same = " AND ".join(f"{name} IS {row}.{name}" for name in _COUNTED)
     duration_ns = f"CAST(round({row}.duration_s * 1e9) AS INTEGER)"
-    return f"""INSERT INTO tally ({names}) SELECT {values}
-      WHERE NOT EXISTS (SELECT 1 FROM tally WHERE {same});
-    UPDATE tally SET num = num {sign} 1, duration_ns = duration_ns {sign} {duration_ns}
+    text = ""
+    for table, columns in _SUMS.items():
+        values = {name: column.format(row) for name, column in columns.items()}
+        same = " AND ".join(f"{name} IS {value}" for name, value in values.items())
+        text += f"""INSERT INTO {table} ({", ".join(values)}) SELECT {", ".join(values.values())}
+      WHERE NOT EXISTS (SELECT 1 FROM {table} WHERE {same});
+    UPDATE {table} SET num = num {sign} 1, duration_ns = duration_ns {sign} {duration_ns}
       WHERE {same};
-    DELETE FROM tally WHERE {same} AND num = 0;"""
+    DELETE FROM {table} WHERE {same} AND num = 0;"""
+    return text
 
 
 # `result` has what edits made of an item, `stands` whether one of these is stored.
@@ -91,12 +110,16 @@ CREATE TABLE tally (
   kind TEXT NOT NULL, is_take INTEGER NOT NULL, {_ATTRIBUTE_COLUMNS}, verdict TEXT,
   take_verdict TEXT, num INTEGER NOT NULL DEFAULT 0, duration_ns INTEGER NOT NULL DEFAULT 0);
 CREATE INDEX tally_key ON tally({", ".join(_COUNTED)});
+CREATE TABLE half_hours (
+  kind TEXT NOT NULL, at_us INTEGER, verdict TEXT,
+  num INTEGER NOT NULL DEFAULT 0, duration_ns INTEGER NOT NULL DEFAULT 0);
+CREATE INDEX half_hours_key ON half_hours(kind, at_us, verdict, num, duration_ns);
 CREATE TABLE fact (name TEXT PRIMARY KEY, value INTEGER NOT NULL) WITHOUT ROWID;
 CREATE TABLE announced (name TEXT PRIMARY KEY) WITHOUT ROWID;
 CREATE INDEX lineage_source ON lineage(source, kind);
 CREATE INDEX result_id ON result(id);
 CREATE INDEX item_dirty ON item(is_dirty) WHERE is_dirty;
-CREATE INDEX item_group ON item(grp, is_compared);
+CREATE INDEX item_group ON item(grp, is_compared, figures, fixed, weight);
 CREATE INDEX item_aligned ON item(aligned) WHERE aligned IS NOT NULL;
 CREATE INDEX item_hours ON item(kind, at_us, verdict, duration_s);
 CREATE INDEX item_text ON item(text);

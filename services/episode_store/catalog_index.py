@@ -126,6 +126,8 @@ class CatalogIndex:
             known = dict(self._run(partial(self._rows, kind=kind)))
             current = self._store.fingerprints(self._store.folder_numbers(kind=kind), kind=kind)
             self._run(partial(self._apply, kind=kind, before=known, current=current, again=True))
+            with self._guard:
+                self._sort(kind, current)
             self._is_checked[kind] = True
         if not self._is_local:
             self._run(partial(_note, names=("listed", "checked")))
@@ -235,8 +237,15 @@ class CatalogIndex:
                 names |= known.keys() - found.keys()
             compared = {name: known[name] for name in names if name in known}
             is_done = self._apply(connection, kind, compared, current, again=is_check)
+        if is_check:
+            self._sort(kind, current)
         self._is_checked[kind] |= is_check
         return is_done
+
+    def _sort(self, kind: Kind, current: Mapping[str, GroupFingerprint]) -> None:
+        """Keep fingerprints in the order of listings, in which comparing them takes a third."""
+        if self._known[kind] == current:
+            self._known[kind] = dict[str, Known](current)
 
     def _compare_some(
         self, connection: sqlite3.Connection, kind: Kind, numbers: Mapping[str, int]

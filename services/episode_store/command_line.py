@@ -26,11 +26,13 @@ from dextouch.errors import InvalidInputError, NotFoundError
 from dextouch.schemas import EpisodeAttributes, RecordingAttributes, json_ready
 from dextouch.serving import configure_logging
 from services.episode_store.catalog import Catalog, ListedRow
-from services.episode_store.command_context import Context, Outcome, table
+from services.episode_store.command_context import Context, Outcome, existing_store, table
 from services.episode_store.filters import EpisodeFilter
 from services.episode_store.parser import store_parser
 
 EXIT_DAMAGED = 1
+# Commands whose store need not exist.
+_MAY_CREATE = ("merge", "restore-backup")
 _SIZES = ("bytes", "kB", "MB", "GB", "TB")
 _OUTCOMES = {True: "success", False: "failure", None: "not judged"}
 
@@ -42,7 +44,9 @@ def main(argv: Sequence[str]) -> int:
     configure_logging(service="episode_store", log_format="auto", level="warning")
     url = options.store or _configured_url()
     run = _COMMANDS.get(options.command) or _editing_command(options.command)
-    result, status = run(Context(EpisodeStore(url), url, options))
+    is_new = options.command in _MAY_CREATE
+    store = EpisodeStore(url) if is_new else existing_store(url)
+    result, status = run(Context(store, url, options))
     write_result(options.json, result)
     return status
 
@@ -78,9 +82,6 @@ def list_items(context: Context) -> Outcome:
     gc.freeze()
     if options.trash:
         return _list_trash(context)
-    root = context.root
-    if root is not None and not root.is_dir():
-        raise NotFoundError(f"store {root}: no such folder; name another with --store")
     if options.kind == "recording" and options.origin is not None:
         raise InvalidInputError("list --kind recording: takes no --origin, recordings have none")
     catalog = Catalog(context.store, progress)
@@ -238,10 +239,11 @@ def delete(context: Context) -> Outcome:
             "delete: --derived, --receipt, --checkpoints and --unsent go with --operator or "
             "--recording"
         )
-    for item_id, kind in [(item_id, context.kind_of(item_id)) for item_id in options.ids]:
+    kinds = {item_id: context.kind_of(item_id) for item_id in options.ids}
+    for item_id, kind in kinds.items():
         context.store.delete(item_id, kind=kind, for_good=options.for_good)
         say(f"{item_id}  {'deleted permanently' if options.for_good else 'in the trash'}")
-    return {"deleted": options.ids, "for_good": options.for_good}, 0
+    return {"deleted": [*kinds], "for_good": options.for_good}, 0
 
 
 def _delete_all_of(context: Context) -> Outcome:
@@ -356,7 +358,7 @@ def purge(context: Context) -> Outcome:
 def repair(context: Context) -> Outcome:
     """Repair damaged items from a copy, and salvage the rest."""
     root, options = context.need_local_root(), context.options
-    copies = EpisodeStore(options.source) if options.source else None
+    copies = existing_store(options.source) if options.source else None
     reports = [] if options.ids else maintenance.repair_uploads(root)
     for kind, name in context.items():
         reports.append(maintenance.repair_group(root, kind, name, copy=_copy(copies, kind, name)))

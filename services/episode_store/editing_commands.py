@@ -11,10 +11,10 @@ from pydantic import ValidationError
 from dextouch import episodes, schemas
 from dextouch.command_line import say
 from dextouch.episodes import EpisodeReader, EpisodeStore, Kind, editing
-from dextouch.errors import DexTouchError, InvalidInputError, NotFoundError
+from dextouch.errors import DexTouchError, InvalidInputError
 from dextouch.geometry import transform_from_pose
 from dextouch.schemas import EditedItem, NewNote, first_problems, json_ready
-from services.episode_store.command_context import Context, Outcome, table
+from services.episode_store.command_context import Context, Outcome, existing_store, table
 
 EXIT_REFUSED = 1
 
@@ -104,10 +104,7 @@ def _say_edit(context: Context, result: EditedItem) -> None:
 def merge(context: Context) -> Outcome:
     """Copy all items of stores into one."""
     options = context.options
-    sources = [EpisodeStore(url) for url in options.sources]
-    for source in sources:
-        if source.folders and not source.root.is_dir():
-            raise NotFoundError(f"merge: store {source.root}: no such folder")
+    sources = [existing_store(url) for url in options.sources]
 
     def show(report: editing.MergeReport) -> None:
         renamed = f"as {report.new_id}" if report.new_id not in {"", report.item_id} else ""

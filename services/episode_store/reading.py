@@ -4,12 +4,12 @@ import hashlib
 from collections.abc import Callable, Iterator
 from functools import partial
 from math import prod
-from typing import Annotated, Any
+from typing import Annotated, Any, Final
 
 import numpy as np
 from fastapi import APIRouter, Header, Query, Response
 from jaxtyping import Float64
-from pydantic import BaseModel, Field
+from pydantic import AfterValidator, BaseModel, Field
 
 from dextouch.episodes import (
     EpisodeReader,
@@ -275,6 +275,11 @@ class ImagesQuery(SpanQuery):
 Images = Annotated[ImagesQuery, Query()]
 
 
+# Differences of two fit int64; until the year 2116. Beyond it is "from the start", "to the end".
+_MOST_NS: Final = 2**62 - 1
+Nanoseconds = Annotated[int, AfterValidator(lambda ns: max(-_MOST_NS, min(ns, _MOST_NS)))]
+
+
 class SignalsQuery(FrozenModel):
     """Query of signals, a comma-separated list, in `points` bins of [start_ns, stop_ns).
 
@@ -283,8 +288,8 @@ class SignalsQuery(FrozenModel):
     """
 
     names: str = Field(min_length=1, max_length=2000)
-    start_ns: int
-    stop_ns: int
+    start_ns: Nanoseconds
+    stop_ns: Nanoseconds
     points: int = Field(default=600, ge=1, le=4000)
 
 

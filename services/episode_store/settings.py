@@ -63,6 +63,7 @@ class EpisodeStoreSettings(ServiceSettings):
     keep_trash_days: float | None = Field(
         default=None,
         ge=0,
+        allow_inf_nan=False,
         description="days until what is in the trash is permanently deleted; otherwise it stays",
     )
     commit_in_process: bool = Field(

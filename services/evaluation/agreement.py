@@ -46,6 +46,7 @@ FIGURES: Final[Mapping[str, Measure]] = {
 CORRELATIONS: Final = ("pearson", "spearman", "kendall")
 # Up to this many assignments of policies are enumerated; otherwise this many are drawn.
 MAX_PERMUTATIONS: Final = 50_000
+_MAX_PAIRS: Final = 2_000_000  # chosen: arrays of 16 MB
 
 
 @dataclass(frozen=True)
@@ -170,7 +171,14 @@ def _figures(real: np.ndarray, imagined: np.ndarray, draws: Draws) -> dict[str, 
 
 def figures_of_draws(draws: ScoreDraws) -> dict[str, Float64[np.ndarray, " draws"]]:
     """Every figure of `FIGURES` in every draw; NaN where undefined."""
-    real, imagined = draws.real, draws.imagined
+    # All pairs of policies of all tasks at once would not fit into memory.
+    num_parts = -(-draws.real.size * draws.real.shape[1] // _MAX_PAIRS)
+    sides = (np.array_split(side, num_parts) for side in (draws.real, draws.imagined))
+    parts = [_figures_of_part(*part) for part in zip(*sides, strict=True)]
+    return {name: np.concatenate([part[name] for part in parts]) for name in FIGURES}
+
+
+def _figures_of_part(real: np.ndarray, imagined: np.ndarray) -> dict[str, np.ndarray]:
     ranks = [_mean_ranks(side) for side in (real, imagined)]
     orders = [np.sign(side[:, :, None] - side[:, None, :]) for side in (real, imagined)]
     gap = np.abs(real[:, :, None] - real[:, None, :])

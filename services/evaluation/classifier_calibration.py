@@ -78,8 +78,7 @@ def fit_calibration(
             f"{outcomes.shape} and risk {risk}; expected one each, both outcomes and "
             "a risk between 0 and 1"
         )
-    (slope,), bias = _platt(odds[:, None], outcomes)
-    # A classifier that ranks endings backwards is not inverted: it is made uninformative.
+    slope, bias = _rising(odds, outcomes)
     fitted = Calibration(temperature=1 / max(slope, 1e-3), bias=bias)
     return fitted.model_copy(
         update={"band": undecided_band(fitted.probabilities(odds), outcomes, risk=risk)}
@@ -112,8 +111,7 @@ def fit_combination(
         weights[:] = slopes
     else:
         better = int(np.argmax(slopes))
-        (slope,), bias = _platt(odds[:, better, None], outcomes > 0.5)
-        weights[better] = max(slope, 0.0)
+        weights[better], bias = _rising(odds[:, better], outcomes > 0.5)
     fitted = Combination(probe_weight=weights[0], world_weight=weights[1], bias=bias, margin=margin)
     agreed = ~fitted.contradictory(of_probe, estimated)
     if not agreed.any():
@@ -148,6 +146,16 @@ def undecided_band(
     return widest
 
 
+def _rising(odds: Float64[np.ndarray, " n"], outcomes: np.ndarray) -> tuple[float, float]:
+    """Slope and bias of one estimate.
+
+    An estimate that ranks endings backwards is not inverted: it is made uninformative, so that the
+    bias is that of the base rate.
+    """
+    (slope,), bias = _platt(odds[:, None], outcomes)
+    return (slope, bias) if slope > 0 else (0.0, _platt(0 * odds[:, None], outcomes)[1])
+
+
 def _platt(
     odds: Float64[np.ndarray, "n inputs"], outcomes: np.ndarray
 ) -> tuple[list[float], float]:
@@ -156,8 +164,9 @@ def _platt(
     target = np.where(outcomes, (wins + 1) / (wins + 2), 1 / (losses + 2))
     num_inputs = odds.shape[1]
     design = np.concatenate([odds, np.ones((len(odds), 1))], axis=1)
-    # In units of the odds' own spread, so that the prior does not depend on the network's scale.
-    pull = np.diag([*np.mean(odds**2, axis=0), 1.0]) * _PRIOR_ENDINGS / 4
+    # In units of the odds' own spread, so that the prior does not depend on the network's scale; it
+    # alone determines the slope of odds that are all 0.
+    pull = np.diag([*np.maximum(np.mean(odds**2, axis=0), 1e-6), 1.0]) * _PRIOR_ENDINGS / 4
     own = np.array([1 / num_inputs] * num_inputs + [0.0])
     fitted = own.copy()
     for _ in range(_MAX_NEWTON_STEPS):

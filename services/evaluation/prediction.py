@@ -181,7 +181,7 @@ def measure_prediction(
     """Errors of predicted futures of scenes that the world was not trained on.
 
     `metrics` are some of `METRICS` or `all_metrics`, and `baselines` names of `BASELINES`. Raises
-    InvalidInputError without a scene.
+    InvalidInputError without a scene, or for one with other steps a second than the world.
     """
     if not scenes:
         raise InvalidInputError("prediction: got no scene, expected at least one")
@@ -189,6 +189,7 @@ def measure_prediction(
     reasons: dict[str, Counter[str]] = {}
     with Progress("scenes", len(scenes)) as progress:
         for scene in scenes:
+            world.description.check_rate(scene.model_rate_hz, of=f"episode {scene.episode_id!r}")
             for source, pairs in found.items():
                 future = _future(source, world, scene, scenes)
                 if isinstance(future, str):

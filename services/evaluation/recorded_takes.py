@@ -59,6 +59,7 @@ class RecordedTake:
     start: MatchedStart
     success: bool
     actions: Float64[np.ndarray, "steps 67"]
+    model_rate_hz: float
 
 
 def read_takes(
@@ -67,8 +68,11 @@ def read_takes(
     tasks: Sequence[str] = (),
     splits: Collection[Split] = (),
     most: int | None = None,
+    further_views: Sequence[str] = (),
 ) -> list[RecordedTake]:
     """Robot episodes of known outcome, whatever recorded them; imagined ones are left out.
+
+    Starts have the images of those `further_views` that a take has.
 
     `tasks` and `splits` of scenes are empty for all; of each task the first `most` by their ids are
     read, None for all. Raises NotFoundError and ConflictError as `select_episodes`.
@@ -80,22 +84,22 @@ def read_takes(
         task = reader.attributes.task
         counts[task] += 1
         if most is None or counts[task] <= most:
-            takes.append(_read_take(reader, number=len(takes)))
+            takes.append(_read_take(reader, len(takes), further_views))
     return takes
 
 
-def _read_take(reader: EpisodeReader, *, number: int) -> RecordedTake:
+def _read_take(reader: EpisodeReader, number: int, further_views: Sequence[str]) -> RecordedTake:
     grid, about = EpisodeGrid(reader), reader.attributes
     start = MatchedStart(
         about.task,
         number,
         about.instruction,
-        grid.observation(),
+        grid.observation(further_views=further_views),
         grid.anchor,
         grid.K_head,
         grid.action_kind,
     )
-    return RecordedTake(about.episode_id, start, grid.success, grid.sent[1:])
+    return RecordedTake(about.episode_id, start, grid.success, grid.sent[1:], about.model_rate_hz)
 
 
 @dataclass(frozen=True)
@@ -184,7 +188,8 @@ def score_recorded(
     Rollouts last as long as their takes, whole chunks of the world; a failed one is recorded as a
     failure, and the others continue. `trained_on` maps trained components, beside the judge, to
     digests of their training starts. Raises ConflictError for a take that was trained on, and
-    InvalidInputError for a task, touch, images or a length that the world or the judge do not know.
+    InvalidInputError for a task, touch, images, a rate or a length that the world or the judge do
+    not know.
     """
     digests = [digest for take in takes for digest in _digests(take.start)]
     judged = {"the success classifier": probe.metadata.training_starts}
@@ -193,6 +198,7 @@ def score_recorded(
     check_judged_touch({description.name: description})
     multiple = description.chunk_multiple
     for take in takes:
+        description.check_rate(take.model_rate_hz, of=f"take {take.episode_id!r}")
         task = take.start.task
         if task not in description.tasks or task not in probe.metadata.settings["instructions"]:
             raise InvalidInputError(

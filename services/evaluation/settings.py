@@ -35,6 +35,8 @@ DEFAULT_PROBE = PRETRAINED / "success_probe.safetensors"
 # twice as often.
 RISK_OF_DECIDED = 0.05
 _SEEDS = re.compile(r"(\d+):(\d+)")
+# Of each path of a list, all but its last component.
+_FOLDERS = re.compile(r"""[^,"=\[\]]*/(?=[^/,"\]])""")
 DEFAULT_MARKS = Path("runs/ratings.sqlite")
 _MARKS = "append-only SQLite file of the marks"
 _STUDY = "name of the study whose rollouts are rated; default: all rollouts of the store"
@@ -168,10 +170,7 @@ def command_line(word: str, arguments: list[str]) -> str:
 
     Files and folders are given by their last path component, since folders differ.
     """
-    named = [
-        f"{flag}{separator}{value.rstrip('/').rsplit('/', 1)[-1]}"
-        for flag, separator, value in (one.rpartition("=") for one in arguments)
-    ]
+    named = [_FOLDERS.sub("", one.rstrip("/")) for one in arguments]
     return shlex.join(["dextouch", "train", word, *named])
 
 

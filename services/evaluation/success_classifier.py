@@ -278,7 +278,7 @@ class Verdict:
 
 
 class SuccessClassifier:
-    """A trained probe.
+    """A trained probe; `classifiable_milestones` are those of each task that it can classify.
 
     Raises InvalidInputError if the weights do not match the shape in the metadata.
     """
@@ -296,7 +296,7 @@ class SuccessClassifier:
             name: Combination.model_validate(values)
             for name, values in settings.get("combination", {}).items()
         }
-        self._classifiable: Mapping[str, Sequence[str]] = settings.get(
+        self.classifiable_milestones: Mapping[str, Sequence[str]] = settings.get(
             "classifiable_milestones", settings.get("told_milestones", {})
         )
         self._network = ClassifierNetwork(self.shape)
@@ -377,7 +377,7 @@ class SuccessClassifier:
         milestones = {
             name: max(float(reached[index]), probability)
             for index, name in enumerate(names)
-            if name in self._classifiable.get(ending.task, ())
+            if name in self.classifiable_milestones.get(ending.task, ())
         }
         return Verdict(
             probability,

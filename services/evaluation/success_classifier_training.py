@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -16,6 +16,7 @@ from dextouch.errors import InvalidInputError
 from dextouch.jobs import worker_pool
 from services.evaluation.classifier_calibration import (
     classifiable_milestones,
+    final_endings,
     fit_calibrations,
     fit_combinations,
     held_out_figures,
@@ -32,6 +33,7 @@ from services.evaluation.settings import ClassifierSettings
 from services.evaluation.success_classifier import (
     DECISION_THRESHOLD,
     KIND,
+    TRUE,
     ClassifierBatch,
     ClassifierNetwork,
     ClassifierShape,
@@ -239,15 +241,16 @@ class ClassifierSets:
     def check_measurable(self) -> None:
         """Check before training that every task can be measured.
 
-        Raises InvalidInputError if the held-out true takes of a task have one outcome only.
+        Raises InvalidInputError if the held-out true takes of a task that end with images have one
+        outcome only.
         """
         for task in sorted({e.task for e in self.training}):
-            outcomes = [e.success for e in self.held_out if e.task == task and not e.imagined]
-            if len(set(outcomes)) < 2:
+            _, outcomes = final_endings(self.held_out, task, TRUE)
+            if len(set(outcomes.tolist())) < 2:
                 raise InvalidInputError(
-                    f"success classifier: {len(outcomes)} true takes of {task!r} are held out, "
-                    f"{sum(outcomes)} of them successful; expected both outcomes: choose a larger "
-                    "--training.held-out-share, or give --held-out STORE"
+                    f"success classifier: {len(outcomes)} true takes of {task!r} that end with "
+                    f"images are held out, {outcomes.sum()} of them successful; expected both "
+                    "outcomes: choose a larger --training.held-out-share, or give --held-out STORE"
                 )
 
 
@@ -304,8 +307,9 @@ def calibrate_success_classifier(
     """Fit the probabilities and the bands of a trained probe anew, for another world model.
 
     The weights and metrics of `base` are kept; they were not trained on the episodes, true and
-    imagined ones. Of the settings only the allowed risks have an effect; those of the checkpoint
-    store the `command` as `calibrated_by`.
+    imagined ones. So are the probabilities, bands and milestones of tasks without an episode. Of
+    the settings only the allowed risks have an effect; those of the checkpoint store the `command`
+    as `calibrated_by`.
     """
     metadata = base.metadata
     names = {*metadata.training_episodes, *(e.episode_id for e in episodes)}
@@ -343,7 +347,9 @@ def _metadata(
         settings={
             "shape": shape.model_dump(mode="json"),
             "training": settings.model_dump(),
-            "instructions": instructions_of((e.task, e.instruction) for e in everything),
+            "instructions": instructions_of(
+                (e.task, e.instruction) for e in everything if e.task in shape.tasks
+            ),
             "threshold": DECISION_THRESHOLD,
         },
         metrics={
@@ -359,11 +365,17 @@ def _metadata(
 def _calibrated(
     checkpoint: Checkpoint, development: Sequence[EndingEpisode], settings: ClassifierSettings
 ) -> Checkpoint:
-    probe = SuccessClassifier(checkpoint)
+    def kept(part: Mapping[str, Any]) -> dict[str, Any]:
+        tasks = {episode.task for episode in development}
+        return {name: one for name, one in part.items() if name.partition("/")[0] not in tasks}
+
+    probe, known = SuccessClassifier(checkpoint), checkpoint.metadata.settings
     calibrations = fit_calibrations(probe, development, risk=settings.risk)
     fitted = {
-        "calibration": {name: one.model_dump() for name, one in calibrations.items()},
-        "classifiable_milestones": classifiable_milestones(probe, development),
+        "calibration": kept(known.get("calibration", {}))
+        | {name: one.model_dump() for name, one in calibrations.items()},
+        "classifiable_milestones": classifiable_milestones(probe, development)
+        | kept(probe.classifiable_milestones),
     }
     calibrated = _with(checkpoint, "settings", fitted)
     combinations = fit_combinations(
@@ -373,6 +385,7 @@ def _calibrated(
         margin=settings.contradiction_margin,
     )
     joined = {name: one.model_dump() for name, one in combinations.items()}
+    joined = kept(known.get("combination", {})) | joined
     return _with(calibrated, "settings", {"combination": joined})
 
 

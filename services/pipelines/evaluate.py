@@ -10,6 +10,7 @@ from dextouch.clients import Policy
 from dextouch.command_line import write_result
 from dextouch.episodes import EpisodeReader, EpisodeStore, needs, select_episodes
 from dextouch.errors import UnknownNameError
+from dextouch.schemas import CHUNK_STEPS
 from dextouch.serving import configure_logging
 from services.evaluation.bundled_policies import bundled_policy, trained_policy, training_starts_of
 from services.evaluation.matched_starts import WorldAddress
@@ -57,7 +58,10 @@ def prediction_main(arguments: Sequence[str]) -> int:
     world = open_world(path, sampling=sampling, needs_touch=False)
     tasks = options.tasks or world.description.tasks
     readers = select_episodes(
-        [store], domain="robot", tasks=tasks, needs=(needs.EVERY_PART, needs.IMAGES)
+        [store],
+        domain="robot",
+        tasks=tasks,
+        needs=(needs.EVERY_PART, needs.IMAGES, needs.longer_than(CHUNK_STEPS)),
     )
     ids = [reader.item_id for reader in readers]
     refuse_trained_episodes(store, ids, path, command="evaluate prediction")
@@ -115,7 +119,14 @@ def recorded_main(arguments: Sequence[str]) -> int:
     options = recorded_parser().parse_args(list(arguments))
     stores = [EpisodeStore(url) for url in options.episodes]
     splits = (options.split,) if options.split else ()
-    takes = read_takes(stores, tasks=options.tasks, splits=splits, most=options.count)
+    world = open_world(options.checkpoint)
+    takes = read_takes(
+        stores,
+        tasks=options.tasks,
+        splits=splits,
+        most=options.count,
+        further_views=world.description.optional_cameras,
+    )
     ids = {take.episode_id for take in takes}
     for store in stores:
         own = sorted(ids & set(store.list()))
@@ -124,7 +135,7 @@ def recorded_main(arguments: Sequence[str]) -> int:
     probe = SuccessClassifier.load(options.probe)
     torch.set_num_threads(1)
     configure_logging(service="evaluate_recorded", log_format="auto", level="warning")
-    with served_world(open_world(options.checkpoint)) as client:
+    with served_world(world) as client:
         (description,) = [one for one in client.worlds() if one.name == WORLD]
         scores = score_recorded(
             takes,

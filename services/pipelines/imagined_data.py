@@ -227,6 +227,7 @@ def refuse_trained_episodes(
 def _picture(
     source: EpisodeStore, imagined: EpisodeReader, num_moments: int | None
 ) -> PredictionPicture:
-    (true_id,) = {one.id for one in imagined.attributes.lineage if one.kind == "episode"}
+    # The source, which may have been made of an episode, too.
+    true_id = [one.id for one in imagined.attributes.lineage if one.kind == "episode"][-1]
     title = f"{imagined.attributes.task}: {true_id}"
     return episode_pair(title, source.open(true_id), imagined, num_moments)

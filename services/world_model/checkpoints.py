@@ -82,7 +82,7 @@ class CheckpointMetadata(FrozenModel):
     domain, those of ancestors included; empty in files of older releases. `horizon_latents` is the
     length of the longest training episode. `text_dropout` and `action_dropout` are the shares of
     windows without instruction and without actions, of this training or of an ancestor's, and
-    `view_dropout` that of windows without a further view; 0 where starts need them all.
+    `view_dropout` that of windows without a further view, likewise; 0 where starts need them all.
     """
 
     format_version: int = 1
@@ -126,6 +126,13 @@ def dropout_shares(text: float, action: float, ancestor: Checkpoint | None) -> t
     if ancestor is not None and not (text or action):
         return ancestor.metadata.text_dropout, ancestor.metadata.action_dropout
     return text, action
+
+
+def view_dropout(share: float, network: NetworkConfig, before: CheckpointMetadata | None) -> float:
+    """Share of windows without a further view for the metadata, as `dropout_shares`."""
+    if not network.further_views:
+        return 0.0
+    return share or (before.view_dropout if before else 0.0)
 
 
 def write_checkpoint(path: Path, model: JointWorldModel, metadata: CheckpointMetadata) -> str:

@@ -15,6 +15,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO, TypeVar
 
+from dextouch.errors import StorageError
 from dextouch.free_text import printable
 
 if TYPE_CHECKING:
@@ -144,7 +145,8 @@ def say(line: str) -> None:
 def write_result(path: Path | None, result: object, *, allow_nan: bool = True) -> None:
     """Write the result of a command as JSON to a file; `-` is standard output, None writes nothing.
 
-    Raises ValueError for a number that is not finite unless `allow_nan`.
+    Raises ValueError for a number that is not finite unless `allow_nan`, StorageError if the file
+    cannot be written.
     """
     if path is not None:
         text = json.dumps(result, indent=2, ensure_ascii=False, allow_nan=allow_nan)
@@ -159,8 +161,13 @@ def write_json_text(path: Path | None, text: str) -> None:
         # Other escapes of JSON: what reads it gets the same text.
         print(printable(text, lines=True), file=_result_stream.get() or sys.stdout, flush=True)
         return
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(text + "\n", encoding="utf-8")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text + "\n", encoding="utf-8")
+    except OSError as error:
+        raise StorageError(
+            f"--json {path}: {error.strerror}; the command itself is done"
+        ) from error
 
 
 @contextmanager

@@ -161,8 +161,9 @@ def test_points_that_turn_show_it():
 
 def test_a_bare_wall_shows_nothing():
     walls = np.full((30, 240, 320, 3), 90, dtype=np.uint8)
-    with pytest.raises(DegenerateMotionError, match=r"0 of 29 steps .* edges"):
-        turning_of_images(stamps_ns(np.arange(30) / 30), iter(walls), K, np.zeros(5))
+    for images in (walls, walls[..., :1], walls[..., 0]):
+        with pytest.raises(DegenerateMotionError, match=r"0 of 29 steps .* edges"):
+            turning_of_images(stamps_ns(np.arange(30) / 30), iter(images), K, np.zeros(5))
 
 
 def test_a_stream_that_did_not_move_along_is_named():

@@ -248,3 +248,18 @@ def test_both_printings_of_a_charuco_board_are_told_apart(legacy, name):
     found = calibrate_found(boards)
     assert abs(found.K[0, 0] - K[0, 0]) <= 4 * found.sigma_fxfycxcy_px[0]
     assert found.rms_px < 0.3
+
+
+@pytest.mark.parametrize("legacy", [False, True])
+def test_markers_of_another_size_than_entered_are_refused_with_their_size(legacy):
+    photos = charuco_photos(CharucoBoard(5, 6, 0.03, 0.022), legacy=legacy)
+    for close_m in (0.021, 0.0235):
+        assert len(find_boards(photos, CharucoBoard(5, 6, 0.03, close_m)).photos) == 6
+    for wrong_m in (0.010, 0.015, 0.018, 0.027, 0.029):
+        board = CharucoBoard(5, 6, 0.03, wrong_m)
+        with pytest.raises(InvalidInputError, match=r"measure 0.7\d of a square") as refused:
+            find_boards(photos, board)
+        assert refused.value.details["marker_ratio"] == pytest.approx(22 / 30, rel=0.03)
+        # One photo is enough, so that a guided run says it at once.
+        with pytest.raises(InvalidInputError, match="would fit these squares"):
+            find_boards(photos[:1], board)

@@ -270,12 +270,8 @@ def test_a_taxel_pressed_with_one_pressure_may_bend():
     glove = Glove(4)
     tare = measure_tare(glove.take(0.0), side="left")
     tips = np.arange(NUM_TAXELS) < 80
-    presses = glove.presses((10.0, 20.0, 20.0))
-    parts = [tips, ~tips, tips]
-    rows = [
-        TaxelPress(press.pressure_kpa, press.sigma_kpa, press.counts, part)
-        for press, part in zip(presses, parts, strict=True)
-    ]
+    presses = zip((10.0, 20.0, 20.0), (tips, ~tips, tips), strict=True)
+    rows = [TaxelPress(p, 0.01 * p, glove.take(p * part), part) for p, part in presses]
     found = fit_gain(tare, rows)
     share = found.sigma_counts_per_kpa / found.gain_counts_per_kpa
     assert np.median(share[tips]) < 0.025
@@ -321,6 +317,78 @@ def test_weak_saturated_bent_and_missing_presses_are_refused():
         TaxelPress(np.nan, 0.1, glove.take(0.0), EVERYWHERE)
     with pytest.raises(UnknownNameError, match="palm"):
         pad_taxels("toe")
+
+
+@pytest.mark.parametrize("factor", [10.0, 6.895, 1e3], ids=["a digit", "psi", "grams"])
+@pytest.mark.parametrize("pressures", [PRESSURES_KPA, (30.0,)], ids=["four", "one"])
+def test_pressures_that_are_all_in_another_unit_are_refused(factor, pressures):
+    glove = Glove(13)
+    tare = measure_tare(glove.take(0.0), side="left")
+    for times, said in ((factor, "times too high"), (1 / factor, "times too low")):
+        presses = [
+            TaxelPress(
+                press.pressure_kpa * times, press.sigma_kpa * times, press.counts, EVERYWHERE
+            )
+            for press in glove.presses(pressures)
+        ]
+        with pytest.raises(InvalidInputError, match=said):
+            fit_gain(tare, presses)
+
+
+def test_the_full_scale_of_a_glove_of_few_bits_is_its_own():
+    """12 bits over 1600 kPa, in a layout of 16 bits."""
+    rng = np.random.default_rng(0)
+
+    def counts(kpa):
+        return np.rint(100 + 2.56 * kpa + rng.normal(scale=0.7, size=(600, 360))).astype(np.uint16)
+
+    tare = measure_tare(counts(0.0), side="left")
+    presses = [TaxelPress(p, 0.01 * p, counts(p), EVERYWHERE) for p in (30.0, 60.0, 120.0)]
+    gain = fit_gain(tare, presses, full_scale_counts=4095.0)
+    np.testing.assert_allclose(np.median(gain.gain_counts_per_kpa), 2.56, rtol=0.02)
+
+
+def test_a_pad_that_is_pressed_and_not_named_is_refused():
+    """Two fingers share a weight, or another one was pressed than is named."""
+    glove = Glove(14)
+    tare = measure_tare(glove.take(0.0), side="left")
+    index = pad_taxels("index")
+    for pressed in ("thumb", "thumb+index", "all"):
+        touched = TaxelPress(20.0, 0.2, glove.take(20.0 * pad_taxels(pressed)), index)
+        with pytest.raises(InvalidInputError, match=r"moved thumb.*which it does not name"):
+            fit_gain(tare, [touched])
+    # What a worn glove feels besides is less.
+    beside = TaxelPress(20.0, 0.2, glove.take(20.0 * index + 2.0 * ~index), index)
+    assert (fit_gain(tare, [beside]).state[index] == 0).all()
+
+
+def test_a_stop_below_full_scale_is_seen():
+    glove = Glove(15)
+    tare = measure_tare(glove.take(0.0), side="left")
+    stop = float(glove.tare.mean() + 25 * glove.gain.mean())
+    presses = [
+        TaxelPress(p.pressure_kpa, p.sigma_kpa, np.minimum(p.counts, stop), p.taxels)
+        for p in glove.presses((10.0, 40.0))
+    ]
+    with pytest.raises(InvalidInputError, match="at full scale"):
+        fit_gain(tare, presses[1:])
+    found = fit_gain(tare, presses)
+    share = found.gain_counts_per_kpa / glove.gain
+    assert np.median(np.abs(share - 1)) < 0.03
+
+
+def test_presses_that_repeat_a_pressure_count_as_one_and_near_ones_show_no_bend():
+    glove = Glove(16)
+    tare = measure_tare(glove.take(0.0), side="left")
+
+    def relative_sigma(pressures):
+        presses = [TaxelPress(p, 0.01 * p, glove.take(p), EVERYWHERE) for p in pressures]
+        found = fit_gain(tare, presses)
+        return np.median(found.sigma_counts_per_kpa / found.gain_counts_per_kpa)
+
+    # The error of a weight stays however often it is used.
+    assert relative_sigma((10.0, 30.0) * 3) == pytest.approx(relative_sigma((10.0, 30.0)), rel=0.03)
+    assert relative_sigma((20.0, 22.0)) > 0.028 > relative_sigma((20.0, 30.0))
 
 
 def test_one_saturated_press_does_not_spoil_the_others():

@@ -2,6 +2,7 @@
 
 import http.client
 import importlib.util
+import json
 import socket
 import subprocess
 import sys
@@ -48,6 +49,18 @@ class S3Server:
             yield
         finally:
             self.request("POST", "/moto-api/reset-auth", b"1000000000")
+
+    @contextmanager
+    def refusing_deletions(self, prefix: str) -> Iterator[None]:
+        """The bucket's policy meanwhile lets nobody delete objects below a prefix."""
+        statement = {"Effect": "Deny", "Principal": "*", "Action": "s3:DeleteObject"}
+        statement["Resource"] = f"arn:aws:s3:::{BUCKET}/{prefix}/*"
+        policy = json.dumps({"Version": "2012-10-17", "Statement": [statement]})
+        assert self.request("PUT", f"/{BUCKET}?policy", policy.encode())[0] in {200, 204}
+        try:
+            yield
+        finally:
+            self.request("DELETE", f"/{BUCKET}?policy")
 
 
 @contextmanager

@@ -14,6 +14,7 @@ from dextouch.command_line import (
     progress,
     write_result,
 )
+from dextouch.errors import StorageError
 
 
 def parser():
@@ -57,6 +58,8 @@ def test_a_result_is_written_to_a_new_folder(tmp_path):
     }
     with pytest.raises(ValueError, match="not JSON compliant"):
         write_result(tmp_path / "b.json", float("nan"), allow_nan=False)
+    with pytest.raises(StorageError, match=f"--json {tmp_path}: Is a directory"):
+        write_result(tmp_path, {})
 
 
 @pytest.mark.parametrize("flags", [["--json", "-"], ["--json=-"]])

@@ -16,12 +16,13 @@ from dextouch.streams import pack, unpack
 
 def test_round_trip():
     arrays = {"a": np.arange(6, dtype=np.float32).reshape(2, 3), "b": np.zeros((0, 2), np.int64)}
+    arrays |= {"one": np.array(0.5), "columns": np.arange(6, dtype=np.uint16).reshape(2, 3).T}
     fields, back = unpack(pack({"n": 1, "t": "é"}, arrays), max_bytes=10_000)
     assert fields == {"n": 1, "t": "é"}
-    assert set(back) == {"a", "b"}
+    assert set(back) == set(arrays)
     for name, array in arrays.items():
         np.testing.assert_array_equal(back[name], array)
-        assert back[name].dtype == array.dtype
+        assert (back[name].dtype, back[name].shape) == (array.dtype, array.shape)
 
 
 def test_too_large_is_refused():

@@ -21,6 +21,8 @@ OVERHEAD = HEADER.size + CRC.size
 VERSION = 1
 MAGIC_SIZE = 4
 SEQUENCE_BITS = 32
+# Batches hold no larger one; no device runs for 292 years.
+MAX_STAMP_NS = 2**63 - 1
 SEQUENCE_MODULUS = 1 << SEQUENCE_BITS
 SOURCES = {"none": 0, "left": 1, "right": 2, "head": 3}
 SOURCE_NAMES = {number: name for name, number in SOURCES.items()}
@@ -32,7 +34,7 @@ class DecoderStatistics:
 
     A packet that was overtaken is `lost` until it comes, from then on `late`: `lost` may shrink.
     `suspects` are packets that were held back although all that their family checks held: their
-    numbers cannot be readings.
+    numbers cannot be readings, or their stamp no time.
     """
 
     packets: int = 0
@@ -291,8 +293,10 @@ class PacketDecoder(FrameSearch[Packet]):
             self._needed = end + CRC.size
             return None
         # Through a view: images are too large to be copied for their checksum.
-        if CRC.unpack_from(data, end)[0] != zlib.crc32(memoryview(data)[position:end]):
-            self.statistics.crc_errors += 1
+        is_intact = CRC.unpack_from(data, end)[0] == zlib.crc32(memoryview(data)[position:end])
+        if not is_intact or t_device_ns > MAX_STAMP_NS:
+            self.statistics.crc_errors += not is_intact
+            self.statistics.suspects += is_intact
             return None
         if magic == self._magic:
             self.sequence.count(sequence, t_device_ns=t_device_ns)

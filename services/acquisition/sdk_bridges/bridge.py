@@ -29,7 +29,13 @@ from dextouch.schemas import first_problems
 from dextouch.tactile.layout import Side
 from services.acquisition.clock import PeriodicCall, StationClock
 from services.acquisition.devices import finger_tracker, numbers, pose_tracker
-from services.acquisition.drivers.packets import SOURCES, VERSION, Packet, encode_packet
+from services.acquisition.drivers.packets import (
+    MAX_STAMP_NS,
+    SOURCES,
+    VERSION,
+    Packet,
+    encode_packet,
+)
 from services.acquisition.drivers.sdk_link import (
     MAX_SOFTWARE,
     PROTOCOL,
@@ -449,8 +455,8 @@ class BridgeServer:
         A stamp that goes back by more than a second is a clock that started anew.
         """
         device, t_ns = reading.device, reading.t_device_ns
-        # Packets have no negative times: such a stamp is from before the clock's start.
-        if t_ns < 0:
+        # Packets have no such times: a negative one is from before the clock's start.
+        if not 0 <= t_ns <= MAX_STAMP_NS:
             self.summary.old[device] += 1
             return
         last_ns = self._last_ns.get(device)

@@ -101,7 +101,7 @@ def turning_of_points(
 
 def turning_of_images(
     t_ns: Int64[np.ndarray, " n"],
-    images: Iterable[UInt8[np.ndarray, "h w channels"]],
+    images: Iterable[UInt8[np.ndarray, "h w *c"]],
     K: Float64[np.ndarray, "3 3"],
     distortion: Distortion,
 ) -> Turning:
@@ -131,7 +131,8 @@ def turning_of_images(
 
 def _small_gray(image: np.ndarray) -> tuple[UInt8[np.ndarray, "h w"], float]:
     """A gray image of at most `_MAX_WIDTH_PX`, and its width over that of the image."""
-    gray = image[..., 0] if image.shape[-1] == 1 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    gray = image.reshape(*image.shape[:2], -1)
+    gray = gray[..., 0] if gray.shape[2] == 1 else cv2.cvtColor(gray, cv2.COLOR_RGB2GRAY)
     scale = min(1.0, _MAX_WIDTH_PX / gray.shape[1])
     if scale < 1.0:
         gray = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)

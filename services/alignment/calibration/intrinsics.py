@@ -27,6 +27,9 @@ MAX_FOCAL_SIGMA = 0.05
 # Corners that turn between neighbours by more than this share of a square are not of the board: the
 # detector took the rim of the print for one. Boards turned by 60 degrees at 0.3 m reach 0.2.
 MAX_CORNER_SHIFT = 0.4
+# Measured sides of markers are up to 3 % too small where blurred, and up to 15 % where a board
+# fills a wide lens; corners move by more than 0.2 px where the entered size is off by a third.
+MAX_MARKER_ERROR = 0.15
 # Views with residuals above this multiple of the median (and this many pixels) have such corners,
 # which move the focal length by more than its reported sigma: 0.5 % by one corner of 25 views.
 MAX_RESIDUAL_RATIO, MIN_WRONG_PX = 3.0, 0.2
@@ -129,7 +132,14 @@ class CameraCalibration:
         return float((self.sigma_fxfycxcy_px[:2] / np.diag(self.K)[:2]).max())
 
 
-View = tuple[Float32[np.ndarray, "_ 3"], Float32[np.ndarray, "_ 2"]]
+class View(NamedTuple):
+    """Corners on the board (m) and in a photo; side of its markers as a share of a square."""
+
+    points_board: Float32[np.ndarray, "_ 3"]
+    pixels_px: Float32[np.ndarray, "_ 2"]
+    marker_ratio: float | None = None
+
+
 Detector = Callable[[np.ndarray], View | None]
 
 
@@ -137,7 +147,8 @@ def find_boards(images: Sequence[np.ndarray], board: Chessboard | CharucoBoard) 
     """Detect a board in photos (uint8 [h, w] or [h, w, 3], all of one size); others are skipped.
 
     Both ways in which ChArUco boards are printed are tried, and the one that fits is named. Raises
-    ShapeError: no images, or of different sizes; InvalidInputError: the board is no board.
+    ShapeError: no images, or of different sizes; InvalidInputError: the board is no board, or its
+    markers have another size.
     """
     photos = [_grey(image, index) for index, image in enumerate(images)]
     if len({photo.shape for photo in photos}) != 1:
@@ -150,11 +161,14 @@ def find_boards(images: Sequence[np.ndarray], board: Chessboard | CharucoBoard) 
         pattern: {index: view for index, p in enumerate(photos) if (view := detect(p)) is not None}
         for pattern, detect in detectors.items()
     }
-    pattern = max(seen, key=lambda name: sum(len(pixels) for _, pixels in seen[name].values()))
+    pattern = max(seen, key=lambda name: sum(len(view.pixels_px) for view in seen[name].values()))
+    views = seen[pattern].values()
+    if isinstance(board, CharucoBoard):
+        _check_markers([v.marker_ratio for v in views if v.marker_ratio is not None], board)
     height, width = photos[0].shape
     return FoundBoards(
-        tuple(points for points, _ in seen[pattern].values()),
-        tuple(pixels for _, pixels in seen[pattern].values()),
+        tuple(view.points_board for view in views),
+        tuple(view.pixels_px for view in views),
         (width, height),
         tuple(seen[pattern]),
         len(photos),
@@ -388,7 +402,7 @@ def _chessboard(board: Chessboard) -> Detector:
         stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-3)
         corners = cv2.cornerSubPix(photo, corners, (half_px, half_px), (-1, -1), stop)
         pixels = np.asarray(corners, dtype=np.float32).reshape(-1, 2)
-        return (points, pixels) if _is_regular(pixels.reshape(*rows.shape, 2)) else None
+        return View(points, pixels) if _is_regular(pixels.reshape(*rows.shape, 2)) else None
 
     return detect
 
@@ -423,16 +437,50 @@ def _charuco(board: CharucoBoard) -> dict[str, Detector]:
         places = np.asarray(printed.getChessboardCorners(), dtype=np.float32)
 
         def detect(photo: np.ndarray) -> View | None:
-            corners, ids, _, _ = charuco.detectBoard(photo)
+            corners, ids, markers, _ = charuco.detectBoard(photo)
             if ids is None or len(ids) < MIN_CORNERS:
                 return None
-            return places[ids.ravel()], np.asarray(corners, dtype=np.float32).reshape(-1, 2)
+            points = places[ids.ravel()]
+            pixels = np.asarray(corners, dtype=np.float32).reshape(-1, 2)
+            outlines = np.asarray(markers, dtype=np.float32).reshape(-1, 4, 2)
+            return View(points, pixels, _marker_ratio(points / board.square_m, pixels, outlines))
 
         return detect
 
     if board.rows % 2:
         return {EITHER_CHARUCO: detector(legacy=False)}
     return {CHARUCO: detector(legacy=False), LEGACY_CHARUCO: detector(legacy=True)}
+
+
+def _marker_ratio(
+    places: np.ndarray, pixels: np.ndarray, outlines_px: Float32[np.ndarray, "markers 4 2"]
+) -> float | None:
+    """Side of the median marker, in squares; None if the corners (in squares) are in a line."""
+    import cv2
+
+    if np.ptp(places[:, :2], axis=0).min() == 0 or not len(outlines_px):
+        return None
+    to_board, _ = cv2.findHomography(pixels, places[:, :2])
+    outlines = cv2.perspectiveTransform(outlines_px.reshape(1, -1, 2), to_board)
+    sides_px, sides = (
+        np.sqrt([cv2.contourArea(np.asarray(one, dtype=np.float32)) for one in each])
+        for each in (outlines_px, outlines.reshape(-1, 4, 2))
+    )
+    # Outlines go through the middles of the outermost dark pixels, half a pixel inside.
+    return float(np.median(sides * (1 + 1 / sides_px)))
+
+
+def _check_markers(ratios: Sequence[float], board: CharucoBoard) -> None:
+    """Refuse markers of another size than entered: they pull the corners between them."""
+    entered, measured = board.marker_m / board.square_m, float(np.median(ratios or [0.0]))
+    if ratios and abs(measured / entered - 1) > MAX_MARKER_ERROR:
+        raise InvalidInputError(
+            f"board: its markers measure {measured:.2f} of a square, got {board.marker_m * 1e3:g} "
+            f"mm for squares of {board.square_m * 1e3:g} mm ({entered:.2f}), expected within "
+            f"{MAX_MARKER_ERROR:.0%}: measure both on the print; markers of "
+            f"{measured * board.square_m * 1e3:.1f} mm would fit these squares",
+            marker_ratio=measured,
+        )
 
 
 def _widths_px(

@@ -29,8 +29,14 @@ from services.alignment.calibration.tactile_tare import (
     steady_level,
 )
 
-# A reading at the stop says nothing about the pressure; so few of them are knocks.
+# A reading at the stop says nothing about the pressure; so few of them are knocks. So many taxels
+# that are noisy at rest, and all at the highest reading for most of a press, are at a stop, too.
 MAX_SATURATED_READINGS = 0.01
+MIN_AT_STOP = 5
+# A pad that is not named may show this part of what those show that are: more is pressed.
+MAX_OTHERS = 0.25
+# Full scales of gloves of one layout differ by some 10 %. Pressures in psi are 6.9 times off.
+MAX_RANGE_RATIO = 5.0
 # Below this highest pressure the straight line is not seen, however low the noise.
 MIN_RANGE_KPA = 5.0
 MAX_RELATIVE_SIGMA = 0.1
@@ -45,6 +51,8 @@ MIN_TREND_SIGMAS = 2.0
 MIN_PRESSURE_SIGMA = 2e-3
 # A trend that differs by less from a straight line through zero cannot be told from a gain.
 MIN_TREND_SHARE = 0.05
+# Pressures of a taxel that differ by less are as one: they do not show how it bends.
+MIN_PRESSURE_RATIO = 1.25
 # Between the halves of a press the counts may creep by this part of the response.
 MAX_CREEP = 0.1
 MAX_CREEPING = 0.25
@@ -204,8 +212,9 @@ def fit_gain(
 
     Taxels that do not answer, saturate in all presses, bend, or were pressed too little for 10 % of
     gain are refused. Raises InvalidInputError: no press, no taxel that answers, counts that fall
-    under pressure, pressures that do not belong to the takes, or a glove that bends or drifts by
-    above 10 %.
+    under pressure, pads that are pressed and not named, pressures that do not belong to the takes,
+    or that make a full scale five times off the layout's, or a glove that bends or drifts by above
+    10 %.
     """
     if not presses:
         raise InvalidInputError("gain: got no press, expected at least one known pressure")
@@ -220,6 +229,8 @@ def fit_gain(
     state[~pressed & (state == OK)] = UNPROVEN
     state[pressed & (state == UNPROVEN)] = OK
     gain, sigma, zero, excess = _lines(points)
+    precise = gain[(state == OK) & (sigma < MAX_RELATIVE_SIGMA * gain)]
+    _check_range(precise, tare.layout, full_scale_counts)
     # How long a touch lasts is not known, hence neither what it has crept: that is an error.
     creep = float(np.median([abs(_creep(press, tare)) for press in presses]))
     sigma = np.hypot(sigma, gain * np.hypot(creep, _trend(points, gain, state == OK)))
@@ -256,13 +267,56 @@ def _points(tare: TaxelTare, presses: Sequence[TaxelPress], full_scale_counts: f
         raw = checked_counts(press.counts, what=what, layout=tare.layout)
         level = steady_level(raw)
         _check_steady(raw, level, press, tare)
-        at_stop = tare.select((raw >= limit).mean(axis=0))
+        _check_others(level, press, tare)
+        at_stop = tare.select((raw >= min(limit, _stop_counts(raw, press, tare))).mean(axis=0))
         is_full = press.taxels & (at_stop > MAX_SATURATED_READINGS)
         used = press.taxels & ~is_full
         rows.append(([press.pressure_kpa], [press.sigma_kpa], *of_taxels(level), used, is_full))
     everywhere = np.ones(tare.layout.num_taxels, dtype=np.bool_)
     rows.append(([0.0], [0.0], *of_taxels(tare.level), everywhere, ~everywhere))
     return _Points(*map(np.array, zip(*rows, strict=True)))
+
+
+def _stop_counts(raw: np.ndarray, press: TaxelPress, tare: TaxelTare) -> float:
+    """The reading at which pressed taxels end, infinity if they do not."""
+    is_noisy = press.taxels & (tare.select(tare.level.noise_counts) > 0.5)
+    readings = tare.select(raw)[:, is_noisy]
+    top = readings.max(initial=-np.inf)
+    num_at_top = ((readings == top).mean(axis=0) > 0.5).sum()
+    return float(top) if num_at_top >= MIN_AT_STOP else np.inf
+
+
+def _check_others(level: Level, press: TaxelPress, tare: TaxelTare) -> None:
+    response = np.abs(tare.select(level.mean_counts - tare.level.mean_counts))
+    least = max(MIN_MOVE_COUNTS, MAX_OTHERS * float(np.median(response[press.taxels])))
+    others = [
+        part
+        for part, pad in _slices(tare.layout).items()
+        if not press.taxels[pad].any() and np.median(response[pad]) > least
+    ]
+    if others:
+        raise InvalidInputError(
+            f"press of {press.pressure_kpa:g} kPa: moved {', '.join(others)}, which it does not "
+            "name; press only the named pads, since a weight is shared by all that it lies on, or "
+            "name all that a known pressure reaches; if nothing touched them, record the rest take "
+            "again, just before the presses"
+        )
+
+
+def _check_range(gain: np.ndarray, layout: TactileLayout, full_scale_counts: float) -> None:
+    if not len(gain):
+        return
+    # Gains are in the same steps of readings as this full scale, which may be below the layout's.
+    highest = min(full_scale_counts, layout.full_scale / reading_step(layout))
+    full_scale_kpa = highest / float(np.median(gain))
+    ratio = full_scale_kpa / layout.range_kpa
+    if not 1 / MAX_RANGE_RATIO < ratio < MAX_RANGE_RATIO:
+        times = f"{max(ratio, 1 / ratio):.3g} times too {'high' if ratio > 1 else 'low'}"
+        raise InvalidInputError(
+            f"gain: the presses make {full_scale_kpa:.3g} kPa of full scale, expected about "
+            f"{layout.range_kpa:g} kPa: the pressures seem {times}; enter them in kPa (a psi is "
+            "6.895 kPa), or weights in kg and areas in cm2"
+        )
 
 
 def _check_steady(raw: np.ndarray, level: Level, press: TaxelPress, tare: TaxelTare) -> None:
@@ -294,7 +348,8 @@ def _trend(points: _Points, gain: np.ndarray, good: np.ndarray) -> Float64[np.nd
     """Error of gains, as a share, by trends of all taxels, or the largest bend tolerated."""
     used = points.used[:-1] & good & (gain > 0)
     highest_kpa = np.where(used, points.pressure_kpa[:-1], 0.0).max(axis=0)
-    has_one = highest_kpa <= np.where(used, points.pressure_kpa[:-1], np.inf).min(axis=0)
+    lowest_kpa = np.where(used, points.pressure_kpa[:-1], np.inf).min(axis=0)
+    has_one = highest_kpa <= MIN_PRESSURE_RATIO * lowest_kpa
     is_informative = used.any(axis=1)
     if not is_informative.any():
         return np.zeros(len(gain))
@@ -325,7 +380,10 @@ def _trend(points: _Points, gain: np.ndarray, good: np.ndarray) -> Float64[np.nd
         if length > MIN_TREND_SHARE * np.linalg.norm(trend / sigma_kpa) and (
             sigmas > MIN_TREND_SIGMAS
         ):
-            found[name] = sigmas / length * effect
+            # Pressures near each other hardly tell a trend from their own errors, and a large one
+            # is not expected.
+            chance = effect / length / MAX_NONLINEARITY
+            found[name] = sigmas / length * effect / (1 + chance**2)
     worst = max(found, key=lambda name: found[name], default="")
     if found and found[worst] > MAX_RELATIVE_SIGMA:
         raise InvalidInputError(
@@ -334,7 +392,8 @@ def _trend(points: _Points, gain: np.ndarray, good: np.ndarray) -> Float64[np.nd
             "these takes, or the glove did not settle; check the list of presses, take the rest "
             "take just before them, and press less where the response bends"
         )
-    return np.where(has_one, MAX_NONLINEARITY / np.sqrt(3), found.get(worst, 0.0))
+    seen = found.get(worst, 0.0)
+    return np.where(has_one, max(MAX_NONLINEARITY / np.sqrt(3), seen), seen)
 
 
 def _check_direction(points: _Points) -> None:
@@ -368,8 +427,10 @@ def _silent_under_pressure(points: _Points) -> Bool[np.ndarray, " taxels"]:
 def _lines(points: _Points) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Gain, its sigma, zero and excess (χ² a degree of freedom) of taxels' lines (York 1966)."""
     P, gain = points.pressure_kpa, np.zeros(points.counts.shape[1])
+    # A weight or gauge that is used again errs alike: so many presses count as one.
+    num_same = np.maximum((P == P.T).astype(np.int64) @ points.used, 1)
     for _ in range(ROUNDS):
-        variance = points.sigma_counts**2 + (gain * points.sigma_kpa) ** 2
+        variance = points.sigma_counts**2 + num_same * (gain * points.sigma_kpa) ** 2
         weight = np.where(points.used, 1 / np.maximum(variance, 1e-12), 0.0)
         total = weight.sum(axis=0)
         mean_P, mean_c = ((weight * values).sum(axis=0) / total for values in (P, points.counts))

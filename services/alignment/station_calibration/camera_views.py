@@ -13,6 +13,7 @@ import numpy as np
 from dextouch.clients import HttpLink
 from dextouch.errors import NotFoundError, StaleDataError
 from dextouch.geometry import NUM_DISTORTION
+from dextouch.schemas import StationHealth
 from dextouch.tactile.layout import Side, TactileLayout
 from services.alignment.calibration.intrinsics import CameraCalibration, calibrate_found
 from services.alignment.calibration.tactile_gain import GloveCalibration, filled_gain
@@ -43,6 +44,9 @@ from services.alignment.station_calibration.record import (
 # OpenCV's pixel origin is the centre of the first pixel, DexTouch's its corner.
 PIXEL_SHIFT_PX = 0.5
 LIVE_PERIOD_S = 0.2
+# Devices that were just started send none at first: chosen, several times what a busy computer
+# needs for the first image of a simulated camera.
+MAX_FIRST_IMAGE_S = 30.0
 WATCH_PERIOD_S = 1.0
 # A board that moved by more between two live images is motion-blurred (0.5 px at 6 px).
 MAX_MOTION_PX = 1.5
@@ -286,7 +290,11 @@ def folder_arrivals(folder: Path, *, wait: Wait = time.sleep) -> Arrivals:
 
 
 def station_arrivals(link: HttpLink, camera: str, *, wait: Wait = time.sleep) -> Arrivals:
-    """Yield new images of a station's camera at 5 Hz, indefinitely, skipping repeated ones."""
+    """Yield new images of a station's camera at 5 Hz, indefinitely, skipping repeated ones.
+
+    Raises NotFoundError: no such camera, or no image within 30 s.
+    """
+    wait_for_camera(link, camera, wait=wait)
     last = b""
     for number in count():
         data = live_image(link, camera)
@@ -294,6 +302,31 @@ def station_arrivals(link: HttpLink, camera: str, *, wait: Wait = time.sleep) ->
             last = data
             yield f"live image {number}", data
         wait(LIVE_PERIOD_S)
+
+
+def wait_for_camera(link: HttpLink, camera: str, *, wait: Wait) -> None:
+    """Wait for the first image of a station's camera.
+
+    Raises NotFoundError: none within 30 s, or at once if the station has no such camera.
+    """
+    reply = link.request("GET", "/v1/health")
+    health = StationHealth.model_validate_json(reply.body, extra="ignore")
+    names = [
+        stream.stream.removeprefix("camera_")
+        for stream in health.streams
+        if stream.stream.startswith("camera_")
+    ]
+    if camera not in names:
+        listed = ", ".join(sorted(names)) or "none"
+        raise NotFoundError(f"camera {camera!r}: the station has no such camera; it has: {listed}")
+    for _ in range(round(MAX_FIRST_IMAGE_S / LIVE_PERIOD_S)):
+        try:
+            live_image(link, camera)
+        except NotFoundError:
+            wait(LIVE_PERIOD_S)
+        else:
+            return
+    live_image(link, camera)
 
 
 def live_image(link: HttpLink, camera: str) -> bytes:

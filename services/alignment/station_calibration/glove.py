@@ -263,7 +263,8 @@ class Guide:
         others = ", ".join(f"{n} {state}" for state, n in found.items() if state != "ok")
         return (
             f"{len(presses)} presses: {found['ok']} of {tare.layout.num_taxels} taxels known"
-            f"{f' ({others})' if others else ''}; more pressures show bends"
+            f"{f' ({others})' if others else ''}; more pressures show bends, and a low one "
+            "again at the end a drift"
         )
 
     def _full_scale(self, tare: TaxelTare) -> float:

@@ -43,6 +43,7 @@ from services.alignment.station_calibration.camera_views import (
     motion_px,
     read_lens,
     turns_picture,
+    wait_for_camera,
 )
 from services.alignment.station_calibration.record import (
     TRACKERS,
@@ -216,7 +217,11 @@ class Sighting(NamedTuple):
 def station_sightings(
     link: HttpLink, camera: str, *, wait: Callable[[float], None] = time.sleep
 ) -> Iterator[Sighting]:
-    """Yield live images of a station's camera and its tracker's poses at 5 Hz, indefinitely."""
+    """Yield live images of a station's camera and its tracker's poses at 5 Hz, indefinitely.
+
+    Raises NotFoundError: no such camera, or no image within 30 s.
+    """
+    wait_for_camera(link, camera, wait=wait)
     last = b""
 
     def pose() -> np.ndarray | None:

@@ -42,10 +42,11 @@ def looked_at(stream: DatedStream) -> tuple[DatedStream, View | None]:
     """A camera's stream with what is wrong with single images, and what was looked at.
 
     The view has no matrix yet. Damaged images are said elsewhere, and nothing is looked at then, or
-    where images are too small for blocks of several pixels.
+    where images are depths, or too small for blocks of several pixels.
     """
     height, width = stream.descriptor.shape[:2]
-    if height < 2 * PICTURE_SHAPE[0] or width < 2 * PICTURE_SHAPE[1]:
+    is_small = height < 2 * PICTURE_SHAPE[0] or width < 2 * PICTURE_SHAPE[1]
+    if is_small or stream.descriptor.dtype != "uint8":
         return stream, None
     count, name = len(stream.t_ns), stream.name
     first = max(0, count - MAX_LOOKED) // 2

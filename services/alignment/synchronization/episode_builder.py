@@ -2,6 +2,7 @@
 
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import cast, get_args
 
 import numpy as np
@@ -28,7 +29,7 @@ from dextouch.streams import (
     implausible_values,
     lasting_jumps,
 )
-from dextouch.tactile.layout import common_layout
+from dextouch.tactile.layout import SIDES, TactileLayout, common_layout
 from services.alignment.settings import AlignmentOptions
 from services.alignment.synchronization import OnProgress, progress_within
 from services.alignment.synchronization.checked_images import check_views, looked_at
@@ -43,12 +44,14 @@ from services.alignment.synchronization.grid_actions import (
 )
 from services.alignment.synchronization.recorded_streams import (
     Block,
+    Conversion,
     DatedStream,
     EpisodeStream,
     LoadedStream,
     check_lens,
     cut_stream,
     date_stream,
+    is_one_pose,
     marker_streams,
     with_tracked_objects,
 )
@@ -110,10 +113,11 @@ def checked_stream(stream: DatedStream, *, max_gap_ns: int) -> CheckedStream:
     Where a tracker found itself anew, a gap is made longer than `max_gap_ns`, the longest that is
     interpolated. Raises InvalidInputError: the whole stream is implausible (`details`).
     """
-    kind, name = stream.descriptor.kind, stream.name
+    name, is_pose = stream.name, is_one_pose(stream.descriptor)
     if stream.implausible:
         return CheckedStream(*_left_out(stream, list(stream.implausible)))
-    if kind not in {"pose", "keypoints", "robot_state"} or len(stream.t_ns) < 2:
+    can_check = is_pose or stream.descriptor.kind in {"keypoints", "robot_state"}
+    if not can_check or len(stream.t_ns) < 2:
         return CheckedStream(stream)
     raw = replace(stream, convert=np.asarray).load().values
     recorded = stream.recording.streams[name]
@@ -128,7 +132,7 @@ def checked_stream(stream: DatedStream, *, max_gap_ns: int) -> CheckedStream:
             )
     stream = _without_nodes(stream, found)
     stream, parts_ns = _left_out(stream, [one for one in found if one.nodes is None])
-    if kind == "pose" and not name.endswith(COMMANDED):
+    if is_pose and not name.endswith(COMMANDED):
         return _cut_at_lasting_jumps(CheckedStream(stream, parts_ns), max_gap_ns)
     return CheckedStream(stream, parts_ns)
 
@@ -139,7 +143,7 @@ def check_bodies(streams: Mapping[str, DatedStream], domain: Domain) -> None:
         return
     t_ns = streams["head"].t_ns
     names = (*BODIES, *(name for name in streams if name.endswith(COMMANDED)))
-    bodies = {n: streams[n] for n in names if n in streams and streams[n].descriptor.kind == "pose"}
+    bodies = {n: streams[n] for n in names if n in streams and is_one_pose(streams[n].descriptor)}
     poses = {name: _poses_at(stream, t_ns) for name, stream in bodies.items()}
     to_body = {name: stream.convert for name, stream in bodies.items()}
     found = implausible_bodies(poses, to_body, of_robot=domain == "robot")
@@ -156,11 +160,11 @@ def check_hand_traces(streams: Mapping[str, DatedStream]) -> None:
     traces = HandTraces()
     if not any(name.startswith("keypoints") for name in streams):
         return
-    for name, stream in streams.items():
-        if name.startswith(("keypoints", "tactile")) or name in BODIES[1:]:
-            about = stream.descriptor
+    for name in (f"{kind}_{side}" for kind in ("keypoints", "tactile", "wrist") for side in SIDES):
+        if name in streams:
+            about = streams[name].descriptor
             layout = about.tactile_layout if about.kind == "tactile" else None
-            for piece in stream.pieces():
+            for piece in streams[name].pieces():
                 traces.add(name, piece.t_ns, piece.values, layout)
     for name, (cause, message) in traces.found().items():
         text = f"stream {name!r}: {message}, and record again"
@@ -372,7 +376,7 @@ def find_span(
         on_progress(progress_within("placing", number / len(names), name))
         # Pressures of an hour do not fit in memory, the forces of its pads do.
         layout = streams[name].descriptor.tactile_layout
-        of = layout.pad_forces_n if name in TOUCH_STREAMS else np.asarray
+        of: Conversion = partial(_pad_forces_n, layout) if name in TOUCH_STREAMS else np.asarray
         parts[name] = _seen(streams[name].load(of))
         if name not in TOUCH_STREAMS and len(parts[name].t_ns) < MIN_USABLE:
             # Such as a hand that was never seen.
@@ -475,6 +479,13 @@ def _check_hands(recording: RecordingReader, streams: Collection[str]) -> None:
             f"one of them at least; it has {sorted(recording.streams)}",
             missing=of_hands,
         )
+
+
+def _pad_forces_n(layout: TactileLayout, kpa: np.ndarray) -> Float64[np.ndarray, "n 6"]:
+    """Forces of pads; NaN for samples that miss a taxel."""
+    whole = np.isfinite(kpa).all(axis=1)
+    forces_n = layout.pad_forces_n(np.nan_to_num(kpa))
+    return np.where(whole[:, None], forces_n, np.nan)
 
 
 def _seen(stream: LoadedStream) -> LoadedStream:

@@ -167,7 +167,7 @@ def date_stream(recording: RecordingReader, name: str) -> DatedStream:
         T = None if side is None else calibrated_transform(calibration, calibration_name(side))
         if T is not None:
             convert = partial(to_wrist_axes, T_keypoints_wrist=T)
-    elif descriptor.kind == "pose":
+    elif is_one_pose(descriptor):
         T_tracker_body = calibrated_transform(calibration, MOUNTS.get(name, ""))
         T_world_base = None
         if descriptor.frame == BASE_FRAME:
@@ -182,6 +182,11 @@ def date_stream(recording: RecordingReader, name: str) -> DatedStream:
             descriptor = descriptor.model_copy(update={"frame": "world"})
         convert = partial(moved_poses, T_world_base=T_world_base, T_tracker_body=T_tracker_body)
     return DatedStream(recording, descriptor, timing, convert)
+
+
+def is_one_pose(descriptor: StreamDescriptor) -> bool:
+    """Whether samples are poses of one body, not of several as other programs send them."""
+    return descriptor.kind == "pose" and descriptor.shape == (7,)
 
 
 def cut_stream(stream: DatedStream, origin_ns: int, last_ns: int) -> EpisodeStream:
@@ -362,7 +367,7 @@ def with_tracked_objects(
                     + "; expected the streams of the head camera and its pose, its matrix, and one "
                     "source of the object's pose"
                 )
-        elif stream is None or stream.descriptor.kind != "pose":
+        elif stream is None or not is_one_pose(stream.descriptor):
             raise InvalidInputError(
                 f"object {one.name!r}: has no markers, and the recording has no poses "
                 f"{one.stream!r}; put a tracker with this stream name on it, or give its markers "

@@ -64,7 +64,11 @@ def place_on_grid(
     outside = (grid_ns < t_ns[0]) | (grid_ns > t_ns[-1])
     near = (grid_ns >= t_ns[0] - reach_ns) & (grid_ns <= t_ns[-1] + reach_ns)
     continued = outside & near & (span <= max_gap_ns)
-    weight = np.where(continued, (grid_ns - t_ns[left]) / span, weight)
+    # Beyond the ends from the end itself: samples of a burst are closer than they were taken.
+    beyond_ns = grid_ns - t_ns[left + (weight == 1)]
+    # A stream may be faster than declared.
+    least_ns = min(period_ns / 2, float(np.median(np.diff(t_ns))))
+    weight = np.where(continued, weight + beyond_ns / np.maximum(span, least_ns), weight)
     return GridPlacement(left, weight, valid | continued)
 
 

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Int64
+from jaxtyping import Bool, Int64
 
 from dextouch.clocks import (
     corrected_stamps,
@@ -14,7 +14,8 @@ from dextouch.clocks import (
     prefers_sequence,
     unwrap_counter,
 )
-from dextouch.errors import ClockFitError
+from dextouch.clocks.clock_model import AHEAD_NS, MIN_SAMPLES
+from dextouch.errors import ClockFitError, InvalidInputError
 from dextouch.schemas import ClockMethod, ClockReport, ClockWarning
 from dextouch.streams import NO_DEVICE_TIME, NO_SEQUENCE, SampleBatch, StreamDescriptor
 from services.alignment.synchronization.resampling import runs_of
@@ -80,13 +81,13 @@ def time_stream(
 
     The device's stamps are used where there are any (unless samples are numbered and the stamps are
     declared or shown to be coarser than a quarter of the period), else its sequence numbers times
-    the period, else the count of samples that a steady device must have sent, else the arrivals.
-    The calibrated path delay `latency_ns` is taken away; its sigma is None if it was not measured.
-    Raises ClockFitError: too few samples, or stamps that no clock gives; names the stream.
+    the period, else the count of samples that a steady device must have sent, else the arrivals, as
+    of less than ten samples. The calibrated path delay `latency_ns` is taken away; its sigma is
+    None if it was not measured. Raises ClockFitError: stamps that no clock gives; names the stream.
     """
     try:
         dated = _dated(batch, descriptor)
-    except ClockFitError as error:
+    except InvalidInputError as error:
         raise ClockFitError(
             f"stream {descriptor.name!r}: {error.message}", stream=descriptor.name, **error.details
         ) from error
@@ -123,8 +124,9 @@ def _warnings(dated: _Dated, period_ns: int) -> tuple[ClockWarning, ...]:
 
 def _dated(batch: SampleBatch, descriptor: StreamDescriptor) -> _Dated:
     capabilities = descriptor.capabilities
-    has_time = not (batch.t_device_ns == NO_DEVICE_TIME).any()
-    has_sequence = not (batch.sequence == NO_SEQUENCE).any()
+    is_enough = len(batch) >= MIN_SAMPLES
+    has_time = is_enough and not (batch.t_device_ns == NO_DEVICE_TIME).any()
+    has_sequence = is_enough and not (batch.sequence == NO_SEQUENCE).any()
     period_ns = descriptor.period_ns()
     bits, tick_ns = capabilities.device_time_bits, capabilities.tick_ns
     stamped = numbered = None
@@ -207,8 +209,10 @@ def _fitted(
         device_ns = corrected_stamps(device_ns, batch.t_host_ns)
     model, num_lost = fit_clock(device_ns, batch.t_host_ns), 0
     if not (batch.sequence == NO_SEQUENCE).any():
+        starts = np.flatnonzero(_restarts(batch, descriptor)) + 1
         bits = descriptor.capabilities.sequence_bits
-        num_lost = count_lost_samples(batch.sequence, bits=bits)
+        parts = np.split(batch.sequence, starts)
+        num_lost = sum(count_lost_samples(part, bits=bits) for part in parts)
     return _Dated(
         model.to_host_ns(device_ns, batch.t_host_ns),
         method,
@@ -219,6 +223,13 @@ def _fitted(
         model.lateness_ns,
         model.has_unsure_stops,
     )
+
+
+def _restarts(batch: SampleBatch, descriptor: StreamDescriptor) -> Bool[np.ndarray, " steps"]:
+    """Whether the number after each sample is far ahead of its arrival: the device began anew."""
+    bits, period_ns = descriptor.capabilities.sequence_bits, descriptor.period_ns()
+    numbers_ns = _unwrap(batch.sequence * period_ns, bits, period_ns, batch)
+    return np.asarray(np.diff(numbers_ns) - np.diff(batch.t_host_ns) > AHEAD_NS)
 
 
 def _counted(batch: SampleBatch, period_ns: int) -> _Dated:

@@ -258,13 +258,19 @@ def train_cloned_policy(
     """The policy trained on successful episodes and, if requested, an early one.
 
     Failed episodes are skipped. The early policy is that after the share `early_at` of the
-    training. Metadata hold the held-out error, and that of the mean chunk.
+    training. Metadata hold the held-out error, and that of the mean chunk. Raises InvalidInputError
+    for a task without a demonstration that is long enough and not held out.
     """
     torch.manual_seed(settings.seed)
     tasks = tuple(sorted({item.task for item in episodes}))
     shape = CloningShape(tasks=tasks, image_size_px=episodes[0].moments[0].image.shape[0])
     training, held_out = split_by_scene(episodes, held_out_share=settings.held_out_share)
     learned, tested = decisions_of(training, shape), decisions_of(held_out, shape)
+    if absent := [task for at, task in enumerate(tasks) if not (learned.task == at).any()]:
+        raise InvalidInputError(
+            f"behaviour cloning: of {', '.join(absent)} no demonstration that is longer than "
+            f"{CHUNK_STEPS} steps is left to train on; record more, or choose other --tasks"
+        )
     network = CloningNetwork(shape)
     _fit_statistics(network, learned)
 

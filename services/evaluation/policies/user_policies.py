@@ -7,6 +7,7 @@ import sys
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -24,10 +25,10 @@ _OUR_FRAMES = (__file__, "<frozen importlib", importlib.__file__)
 _SOURCE = re.compile(r"(?:(?P<name>[^=]+)=)?(?P<module>[A-Za-z_][\w.]*):(?P<factory>[A-Za-z_]\w*)")
 
 
-def ask(call: Callable[..., Any], *arguments: object, where: str, **keywords: object) -> Any:  # noqa: ANN401 - whatever the policy gives
+def ask(call: Callable[..., Any], *arguments: object, where: str) -> Any:  # noqa: ANN401 - whatever the policy gives
     """Call a function of a policy; InvalidInputError, with its own traceback, if it raised."""
     try:
-        return call(*arguments, **keywords)
+        return call(*arguments)
     except (Exception, SystemExit) as error:  # a policy may raise anything
         raise InvalidInputError(
             f"{where} raised {type(error).__name__}: {error}", traceback=own_traceback(error)
@@ -121,7 +122,7 @@ class PolicySource:
                 f"{called} is {type(factory).__name__}, expected a function or class that returns "
                 "the policy"
             )
-        policy = _loudly(factory, where=called, **arguments)
+        policy = _loudly(partial(factory, **arguments), where=called)
         if not callable(getattr(policy, "act", None)):
             raise InvalidInputError(
                 f"{called} returned {type(policy).__name__} without a method act; expected an "
@@ -185,10 +186,10 @@ class _WithoutReset:
         """Do nothing."""
 
 
-def _loudly(call: Any, *arguments: object, where: str, **keywords: object) -> Any:  # noqa: ANN401
+def _loudly(call: Any, *arguments: object, where: str) -> Any:  # noqa: ANN401
     """`ask`, with the traceback in the message for the policy's author."""
     try:
-        return ask(call, *arguments, where=where, **keywords)
+        return ask(call, *arguments, where=where)
     except InvalidInputError as error:
         raise InvalidInputError(
             f"{error.message}\n{error.details['traceback']}"

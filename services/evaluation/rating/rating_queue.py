@@ -101,13 +101,15 @@ class RatingQueue:
             (stored for (who, _, _), stored in latest.items() if who == rater),
             key=lambda stored: stored.number,
         )
-        seen = [one.mark.episode_id for one in mine if one.mark.presentation != REPEAT]
+        every = self._rollouts.values()
+        # The file may hold marks of other rollouts, too.
+        seen = {one.mark.episode_id for one in mine if one.mark.presentation != REPEAT}
+        seen &= {one.episode_id for one in every}
         given = by_people(stored.mark for stored in latest.values())
         raters = {
             episode_id: sum(one.presentation == FIRST for one in marks)
             for episode_id, marks in given.items()
         }
-        every = self._rollouts.values()
         waiting = [
             one
             for one in every
@@ -116,7 +118,7 @@ class RatingQueue:
         ]
         tied = [one for one in every if self._decides(rater, given.get(one.episode_id, ()))]
         num_open = len(waiting) + len(tied)
-        repeated = self._repeat(rater, mine, len(seen))
+        repeated = self._repeat(rater, mine, seen)
         if repeated is not None:
             return Assignment(repeated, REPEAT, len(seen), num_open)
         if not num_open:
@@ -153,14 +155,13 @@ class RatingQueue:
         is_new = rater not in {one.rater for one in marks}
         return is_new and num_first >= self._raters_per_rollout and bool(vote(marks).tied)
 
-    def _repeat(self, rater: str, mine: list[StoredMark], num_seen: int) -> RatedRollout | None:
-        repeats = {one.mark.episode_id for one in mine if one.mark.presentation == REPEAT}
-        if len(repeats) >= int(num_seen * self._repeat_share):
+    def _repeat(self, rater: str, mine: list[StoredMark], seen: set[str]) -> RatedRollout | None:
+        repeats = {one.mark.episode_id for one in mine if one.mark.presentation == REPEAT} & seen
+        if len(repeats) >= int(len(seen) * self._repeat_share):
             return None
         shown = (one.mark for one in mine[: max(0, len(mine) - REPEAT_GAP)])
-        old = [mark.episode_id for mark in shown if mark.presentation == FIRST]
-        known = [self._rollouts[t] for t in map(token_of, old) if t in self._rollouts]
-        fresh = [one for one in known if one.episode_id not in repeats]
+        old = {mark.episode_id for mark in shown if mark.presentation == FIRST}
+        fresh = [self._rollouts[token_of(name)] for name in (old & seen) - repeats]
         return min(fresh, key=lambda one: _order(rater, one.episode_id), default=None)
 
 
@@ -179,7 +180,7 @@ def rated_rollouts(
     for episode_id in store.list():
         episode = store.open(episode_id)
         about = episode.attributes
-        is_wanted = _is_rated(about) if study is None else study in _studies(about)
+        is_wanted = _is_rated(about) if study is None else study in studies_of(about)
         if is_wanted and about.task in tasks and HEAD_CAMERA in episode.streams:
             found.append(
                 RatedRollout(
@@ -208,7 +209,8 @@ def _is_rated(about: EpisodeAttributes) -> bool:
     return about.origin == "twin" and about.operator is None
 
 
-def _studies(about: EpisodeAttributes) -> set[str]:
+def studies_of(about: EpisodeAttributes) -> set[str]:
+    """Names of the studies of which an episode is a rollout."""
     return {entry.id.partition(": ")[0] for entry in about.lineage if entry.kind == "rollout"}
 
 

@@ -25,6 +25,8 @@ from services.evaluation.statistics import (
 
 Level = Literal["nominal", "interval"]
 LEAST_ALPHA: Final = 0.667
+# Scores in 0 … 1 that differ by rounding alone are equal.
+_ROUNDING: Final = 1e-12
 
 
 @dataclass(frozen=True)
@@ -51,14 +53,14 @@ def krippendorff_alpha(ratings: Float64[np.ndarray, "_ _"], *, level: Level) -> 
     rows = known.sum(axis=1) >= 2
     values, known = np.where(known, ratings, 0.0)[rows], known[rows]
     pooled = values[known]
-    if len(pooled) == 0:
+    if len(pooled) == 0 or np.ptp(pooled) < _ROUNDING:
         return math.nan
     observed = sum(
         _disagreement(row[there], level) / (there.sum() - 1)
         for row, there in zip(values, known, strict=True)
     )
     expected = _disagreement(pooled, level) / (len(pooled) - 1)
-    return float(1 - observed / expected) if expected > 0 else math.nan
+    return float(1 - observed / expected)
 
 
 def alpha_interval(
@@ -101,7 +103,7 @@ def intraclass_correlation(ratings: Float64[np.ndarray, "_ _"]) -> float:
     """
     complete = ratings[np.isfinite(ratings).all(axis=1)]
     num_rollouts, num_raters = complete.shape
-    if min(num_rollouts, num_raters) < 2:
+    if min(num_rollouts, num_raters) < 2 or np.ptp(complete) < _ROUNDING:
         return math.nan
     centred = complete - complete.mean()
     rollouts, raters = centred.mean(axis=1), centred.mean(axis=0)
@@ -118,13 +120,13 @@ def rater_biases(
     ratings: Float64[np.ndarray, "_ _"],
     generator: np.random.Generator,
 ) -> list[RaterBias]:
-    """Bias of each rater who shares rollouts with others, with a bootstrap over rollouts."""
+    """Bias of each rater who shares two rollouts with others, with a bootstrap over rollouts."""
     known = np.isfinite(ratings)
     found = []
     for column, rater in enumerate(raters):
         others = np.delete(ratings, column, axis=1)
         shared = known[:, column] & np.isfinite(others).any(axis=1)
-        if not shared.any():
+        if shared.sum() < 2:
             continue
         differences = ratings[shared, column] - np.nanmean(others[shared], axis=1)
         counts = start_counts(len(differences), generator, num_draws=1000)
@@ -228,7 +230,7 @@ def _task(marks: list[Mark], rubric: Rubric) -> dict[str, Any]:
     alpha = krippendorff_alpha(scores, level="interval")
     between = alpha_interval(scores, generator)
     means = np.array([np.nanmean(row) for row in scores])
-    interval = bootstrap_mean_interval(means, generator) if len(means) else None
+    interval = bootstrap_mean_interval(means, generator) if len(means) > 1 else None
     return {
         "num_rollouts": len(rollouts),
         "num_raters": len(raters),

@@ -28,6 +28,8 @@ LEFT, TOP, SIDE, ROW, WIDTH = 30.0, 38.0, 220.0, 15.0, 260
 INK, QUIET, GRID = "#1b1e24", "#5b6270", "#c9ccd2"
 NAMESPACE: Final = 'xmlns="http://www.w3.org/2000/svg"'
 SHADES: Final = {INK: 1.0, QUIET: 0.7, GRID: 0.25}
+# Width of a letter over its size, on average, in wide sans-serif fonts.
+LETTER: Final = 0.62
 # PNGs have 300 dots an inch, drawn twice as large.
 DOTS, OVERSAMPLING = 300 / 72, 2
 
@@ -65,8 +67,8 @@ def _shapes(pairs: Pairs, title: str) -> list[_Shape]:
 
     bottom = TOP + SIDE
     shapes = [
-        _Shape([(LEFT, 14.0)], INK, 11.0, title),
-        _Shape([(4.0, 31.0)], INK, 9.0, "imagined success"),
+        _label((LEFT, 14.0), 11.0, title),
+        _label((4.0, 31.0), 9.0, "imagined success"),
     ]
     for tick in (0.0, 0.25, 0.5, 0.75, 1.0):
         (x, _), (_, y) = at(tick, 0.0), at(0.0, tick)
@@ -87,9 +89,14 @@ def _shapes(pairs: Pairs, title: str) -> list[_Shape]:
             shapes.append(_Shape(_corners(index, *at(x, y)), colour))
         if found:
             shapes.append(_Shape(_corners(index, LEFT + 5, row), colour))
-            shapes.append(_Shape([(LEFT + 16, row + 3)], INK, 9.0, name))
+            shapes.append(_label((LEFT + 16, row + 3), 9.0, name))
             row += ROW
     return shapes
+
+
+def _label(begin: tuple[float, float], size: float, text: str) -> _Shape:
+    """A text in ink, smaller where it would be wider than the picture."""
+    return _Shape([begin], INK, min(size, (WIDTH - begin[0]) / (LETTER * max(1, len(text)))), text)
 
 
 def _corners(index: int, x: float, y: float) -> list[tuple[float, float]]:

@@ -9,7 +9,7 @@ from copy import copy
 from dataclasses import dataclass, field
 
 from dextouch.clients import Policy
-from dextouch.episodes import EpisodeStore, select_episodes
+from dextouch.episodes import EpisodeStore, needs, select_episodes
 from dextouch.errors import UnavailableError
 from services.evaluation.bundled_policies import bundled_policy, checkpoint_of, training_starts_of
 from services.evaluation.closed_loop import EvaluationPlan, RolloutRunner, begin_matched
@@ -17,6 +17,7 @@ from services.evaluation.matched_starts import FailedStart, MatchedStart, StudyW
 from services.evaluation.policies.open_loop import ReplayPolicy
 from services.evaluation.policies.user_policies import PolicySource
 from services.evaluation.progress import Progress
+from services.evaluation.rating.rating_queue import studies_of
 from services.evaluation.scores import REAL, ClosedLoopReport, Outcome, RolloutFailure
 from services.evaluation.studies.results import (
     PlannedRollout,
@@ -206,19 +207,31 @@ class _Workers:
 
 
 class PolicyFactory:
-    """Creates the policies of a study, those of scripts by `demonstrator`; reads data once."""
+    """Creates the policies of a study, those of scripts by `demonstrator`; reads data once.
+
+    Rollouts of the study itself are not replayed.
+    """
 
     def __init__(
         self, definition: StudyDefinition, demonstrator: Callable[[str], ReplayPolicy]
     ) -> None:
         self._definition = definition
         self._replays: dict[str, ReplayPolicy] = {}
+        # The store may be the one in which the study keeps its rollouts.
+        self._not_own = needs.Need(
+            "rollouts of this study",
+            "replay a store of demonstrations",
+            lambda reader: definition.name not in studies_of(reader.attributes),
+            is_choice=True,
+        )
         for name, choice in definition.policies.items():
             if choice.script is not None:
                 self._replays[name] = demonstrator(choice.script)
             if choice.replay is not None:
                 stores, tasks = [EpisodeStore(choice.replay)], definition.tasks
-                found = select_episodes(stores, domain="robot", tasks=tasks, origins=())
+                found = select_episodes(
+                    stores, domain="robot", tasks=tasks, origins=(), needs=(self._not_own,)
+                )
                 self._replays[name] = ReplayPolicy.of(found)
 
     def load(self) -> dict[str, Policy]:
@@ -249,8 +262,8 @@ class PolicyFactory:
             return None if path is None else digest_of(path)
         if choice.replay is None:
             return None
-        store = EpisodeStore(choice.replay)
-        content = [f"{one} {store.open(one).content_sha256}" for one in sorted(store.list())]
+        readers = map(EpisodeStore(choice.replay).open, sorted(EpisodeStore(choice.replay).list()))
+        content = [f"{r.item_id} {r.content_sha256}" for r in readers if self._not_own.is_met(r)]
         return hashlib.sha256("\n".join(content).encode()).hexdigest()
 
     def _load(self, name: str, choice: PolicyChoice) -> Policy:

@@ -19,7 +19,13 @@ from dextouch.errors import (
     UnavailableError,
 )
 from dextouch.hands import NUM_KEYPOINTS
-from dextouch.serving import MAX_WEBSOCKET_BYTES, RequireScope, create_service_app, serve
+from dextouch.serving import (
+    MAX_WEBSOCKET_BYTES,
+    RequireScope,
+    close_reason,
+    create_service_app,
+    serve,
+)
 from dextouch.streams import pack, unpack
 from dextouch.tactile.layout import Side
 from services.acquisition.devices.kinds import load_calibration
@@ -29,7 +35,6 @@ from services.pipelines.teleoperation.settings import TeleoperationSettings
 
 SCOPE: Final = "teleop"
 _REFUSED: Final = 1008  # policy violation (RFC 6455)
-MAX_REASON_LETTERS: Final = 120  # of 123 bytes that a close frame holds
 _FORMS: Final = ("start", "sample", "stop")
 # Buckets around the period of 1/60 s.
 LATENCY_S: Final = (0.001, 0.002, 0.003, 0.005, 0.007, 0.01, 0.015, 0.02, 0.05, 0.1)
@@ -195,7 +200,8 @@ def _message(received: Any) -> tuple[str, Any]:  # noqa: ANN401 - of ASGI
         )
     [(form, value)] = fields.items()
     if form == "start":
-        angles = value.values() if isinstance(value, dict) else ["none"]
+        is_map = isinstance(value, dict) and all(isinstance(name, str) for name in value)
+        angles = value.values() if is_map else ["none"]
         if not all(isinstance(one, int | float) and not isinstance(one, bool) for one in angles):
             raise InvalidInputError("start: expected a map of joint names to angles in rad")
     if form == "sample":
@@ -245,7 +251,7 @@ def teleoperation_router(settings: TeleoperationSettings) -> APIRouter:
         try:
             name = socket.app.state.access.check(socket.headers.get("authorization"), SCOPE)
         except DexTouchError as error:
-            await socket.close(_REFUSED, error.message[:MAX_REASON_LETTERS])
+            await socket.close(_REFUSED, close_reason(error.message))
             return
         # Clients learn the reason of a close only of accepted connections.
         await socket.accept()
@@ -253,7 +259,7 @@ def teleoperation_router(settings: TeleoperationSettings) -> APIRouter:
             try:
                 await control_as(name, socket, side)
             except DexTouchError as error:
-                await socket.close(_REFUSED, error.message[:MAX_REASON_LETTERS])
+                await socket.close(_REFUSED, close_reason(error.message))
 
     @router.post("/{side}/stop", status_code=204, dependencies=[Depends(RequireScope(SCOPE))])
     async def stop_hand(side: Side) -> None:

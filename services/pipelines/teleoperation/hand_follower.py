@@ -165,6 +165,7 @@ class HandFollower:
         self._ages = _SampleAges()
         self._newest: tuple[HandSample, float, float] | None = None
         self._followed: HandSample | None = None
+        self._solved_ns: int | None = None
         self._last_m: np.ndarray | None = None
         self._fresh_s = -np.inf
         self._sent_s: float | None = None
@@ -267,8 +268,9 @@ class HandFollower:
         if self._T_keypoints_wrist is not None:
             keypoints_m = to_wrist_axes(keypoints_m[None], self._T_keypoints_wrist)[0]
         since_s = self.period_s
-        if self._followed is not None:
-            since_s = (sample.t_device_ns - self._followed.t_device_ns) * 1e-9
+        if self._solved_ns is not None:
+            since_s = (sample.t_device_ns - self._solved_ns) * 1e-9
+        self._solved_ns = sample.t_device_ns
         result = self._retargeter.step(keypoints_m, since_s)
         self._finger_status = tuple(RetargetStatus(int(each)) for each in result.finger_status[0])
         if not result.solved[0].any():

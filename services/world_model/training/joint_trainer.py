@@ -478,7 +478,7 @@ def _metadata(
         tokenizer_digest=before.tokenizer_digest if before else None,
         text_dropout=dropped[0],
         action_dropout=dropped[1],
-        view_dropout=windows.view_dropout if network.further_views else 0.0,
+        view_dropout=checkpoints.view_dropout(windows.view_dropout, network, before),
     )
 
 

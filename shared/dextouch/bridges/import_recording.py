@@ -262,9 +262,14 @@ def _free_name(source: str, taken: Iterable[str]) -> str:
 
 
 def recording_id_of(path: Path, prefix: str = "") -> str:
-    """Id of the recording of a file: its name in lower case, other characters as `-`."""
-    plain = re.sub(r"[^a-z0-9_-]+", "-", f"{prefix}{path.stem}".lower()).strip("-_")
-    return plain[:MAX_ID] or "imported"
+    """Id of the recording of a file: its name in lower case, other characters as `-`.
+
+    Of names without a character of an id, such as Chinese ones, a hash tells them apart.
+    """
+    stem = path.stem.lower()
+    if not re.search(r"[a-z0-9]", stem):
+        stem = f"imported-{hashlib.sha256(stem.encode(errors='replace')).hexdigest()[:8]}"
+    return re.sub(r"[^a-z0-9_-]+", "-", f"{prefix.lower()}{stem}").strip("-_")[:MAX_ID]
 
 
 def file_sha256(path: Path) -> str:

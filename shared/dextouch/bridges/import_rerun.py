@@ -13,6 +13,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.types as arrow_types
 from rerun.chunk import Chunk, RrdReader
+from rerun.error_utils import RerunWarning
 
 from dextouch.bridges.import_images import RAW, check_codec, check_pixels
 from dextouch.bridges.import_messages import (
@@ -117,7 +118,7 @@ def import_rrd(
 
 
 def _chunks(path: Path) -> Iterator[Chunk]:
-    reader, first = _opened(path)[0], None
+    reader, first = opened_rrd(path)[0], None
     try:
         first = next(iter(reader.recordings()), None)
         yield from reader.stream(store=first)
@@ -125,14 +126,18 @@ def _chunks(path: Path) -> Iterator[Chunk]:
         raise CorruptDataError(f"{path}: rerun-sdk cannot read it ({error})") from error
 
 
-def _opened(path: Path) -> tuple[RrdReader, list[str]]:
-    """The reader of a file, and its warnings: of a file without a footer, which may be cut."""
+def opened_rrd(path: Path) -> tuple[RrdReader, list[str]]:
+    """The reader of a file, and its warnings of a footer that lacks: the file may be cut.
+
+    Warnings are recorded of the whole process; those of others are none of the file.
+    """
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         try:
-            return RrdReader(path), [str(one.message) for one in said]
+            reader = RrdReader(path)
         except (ValueError, RuntimeError, OSError, pa.ArrowException) as error:
             raise CorruptDataError(f"{path}: rerun-sdk cannot read it ({error})") from error
+    return reader, [str(one.message) for one in said if issubclass(one.category, RerunWarning)]
 
 
 def _timeline(path: Path, name: str | None) -> tuple[str, list[str]]:
@@ -185,7 +190,7 @@ class _Rows:
 
     def _note_file(self) -> None:
         if self._survey is not None:
-            reader, said = _opened(self._path)
+            reader, said = opened_rrd(self._path)
             for reason in said:
                 self._survey.refuse(self._path.name, "file", reason)
             names = [one.recording_id[:256] for one in reader.recordings()]

@@ -12,8 +12,9 @@ import rerun.blueprint as rrb
 from rerun.components import ImageFormat
 
 from dextouch.bridges.export_files import Block, Reader, TouchPictures, blocks, new_file, touch_side
+from dextouch.bridges.import_rerun import opened_rrd
 from dextouch.episodes import EpisodeReader, is_keyframe
-from dextouch.errors import InvalidInputError
+from dextouch.errors import InvalidInputError, StorageError
 from dextouch.schemas import json_ready
 from dextouch.streams import HEAD_CAMERA, StreamDescriptor
 
@@ -53,9 +54,16 @@ def export_rrd(reader: Reader, path: Path, *, overwrite: bool = False) -> int:
             _log_pinhole(stream, reader)
             num_samples = sum(_log(stream, reader, d) for d in reader.streams.values())
             stream.flush()
-            return num_samples
+        except RuntimeError as error:
+            raise StorageError(f"write {path}: {error}") from error
         finally:
             stream.disconnect()
+        # What fails while the end is written is only logged.
+        if lacks := opened_rrd(path_partial)[1]:
+            raise StorageError(
+                f"write {path}: its end is missing ({lacks[0]}); free space and try again"
+            )
+        return num_samples
 
 
 def entity_of(descriptor: StreamDescriptor) -> str:

@@ -17,6 +17,7 @@ from dextouch.errors import InvalidInputError
 from dextouch.geometry.rotations import vector_from_rotation
 from dextouch.hands.actions import poses_from_actions
 from dextouch.schemas import json_ready
+from dextouch.tactile.layout import TactileLayout, common_layout
 
 MODEL_CAMERAS: Final = ("camera_wrist_left", "camera_wrist_right", "camera_head")
 # Images of a camera by its number, and their times minus those of the steps.
@@ -51,7 +52,8 @@ def export_umi(readers: Iterable[EpisodeReader], path: Path, *, overwrite: bool 
 
     Raises:
         ConflictError: the file exists, and is not to be overwritten.
-        InvalidInputError: no episode, or one whose cameras and image sizes are not the first one's.
+        InvalidInputError: no episode, or one whose cameras, images, rate or taxels are not the
+            first one's.
         StorageError: the write failed.
     """
     with (
@@ -69,8 +71,9 @@ def export_umi(readers: Iterable[EpisodeReader], path: Path, *, overwrite: bool 
 
 
 def _write_group(group: zarr.Group, readers: Iterable[EpisodeReader]) -> int:
-    first: dict[str, tuple[int, ...]] | None = None
+    first: dict[str, tuple[object, ...]] | None = None
     cameras: tuple[str, ...] = ()
+    layouts: list[TactileLayout] = []
     ends = [0]
     episodes: list[JSON] = []
     for reader in readers:
@@ -80,8 +83,9 @@ def _write_group(group: zarr.Group, readers: Iterable[EpisodeReader]) -> int:
         elif shared != first:
             raise InvalidInputError(
                 f"{reader.attributes.episode_id}: got {shared}, expected {first} as in the "
-                "first episode; export episodes of different cameras to different files"
+                "first episode; export episodes that differ in these to different files"
             )
+        layouts = [common_layout([*layouts, reader.tactile_layout], what="UMI export")]
         _append_episode(group, reader, cameras)
         ends.append(ends[-1] + reader.num_steps)
         episodes.append(
@@ -119,14 +123,16 @@ def _append(
     )
 
 
-def _shared(reader: EpisodeReader) -> dict[str, tuple[int, ...]]:
-    """What all episodes of a file have in common: shapes of images and of commanded actions."""
+def _shared(reader: EpisodeReader) -> dict[str, tuple[object, ...]]:
+    """What all episodes of a file have in common: rate, form of images and commanded actions."""
     if reader.num_steps == 0:
         raise InvalidInputError(
             f"{reader.attributes.episode_id}: has no step of the model grid to export"
         )
     names = (*MODEL_CAMERAS, "action_commanded")
-    return {name: reader.streams[name].shape for name in names if name in reader.streams}
+    streams = [reader.streams[name] for name in names if name in reader.streams]
+    forms = {one.name: (one.dtype, *one.shape) for one in streams}
+    return {"model_rate_hz": (reader.attributes.model_rate_hz,), **forms}
 
 
 def _append_episode(group: zarr.Group, reader: EpisodeReader, cameras: tuple[str, ...]) -> None:

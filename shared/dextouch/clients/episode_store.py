@@ -11,6 +11,7 @@ import httpx
 import numpy as np
 from pydantic import BaseModel, ValidationError
 
+from dextouch.clients.http_link import service_address
 from dextouch.episodes import StreamData, Window, decode_window
 from dextouch.errors import DexTouchError, UnavailableError
 from dextouch.schemas import (
@@ -46,7 +47,8 @@ DEFAULT_TIMEOUT_S = 30.0  # chosen: for a busy store
 class EpisodeStoreClient:
     """Client of one store service. Every call may be repeated after UnavailableError.
 
-    `timeout_s` is of one request; `transport` may be an application in this process.
+    `timeout_s` is of one request; `transport` may be an application in this process. Raises
+    InvalidInputError for a URL that is none.
     """
 
     def __init__(
@@ -57,7 +59,8 @@ class EpisodeStoreClient:
         timeout_s: float = DEFAULT_TIMEOUT_S,
         transport: httpx.BaseTransport | None = None,
     ) -> None:
-        headers = {"authorization": f"Bearer {api_key}"} if api_key else {}
+        service_address(url)
+        headers = {"authorization": f"Bearer {api_key.strip()}"} if api_key else {}
         self._http = httpx.Client(
             base_url=url.rstrip("/"),
             headers=headers,

@@ -7,9 +7,10 @@ import http.client
 import itertools
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
-from urllib.parse import urlsplit
+from urllib.parse import SplitResult, urlsplit
 
 from pydantic import ValidationError
 
@@ -51,6 +52,16 @@ class _WholeHttpsRequests(_WholeRequests, http.client.HTTPSConnection):
     """As above, over TLS."""
 
 
+def service_address(url: str, *, what: str = "address") -> SplitResult:
+    """Parts of a service's URL; raises InvalidInputError, which begins with `what`."""
+    # A port may be no number, or too large a one.
+    with suppress(ValueError):
+        parts = urlsplit(url)
+        if parts.scheme in {"http", "https"} and parts.hostname and parts.port != 0:
+            return parts
+    raise InvalidInputError(f"{what}: got {url!r}, expected http(s)://HOST:PORT")
+
+
 class HttpLink:
     """One keep-alive connection; not thread-safe."""
 
@@ -63,14 +74,12 @@ class HttpLink:
         patience_s: float = 0.0,
         pause: Callable[[float], None] = time.sleep,
     ) -> None:
-        parts = urlsplit(url)
-        if parts.scheme not in {"http", "https"} or not parts.hostname:
-            raise InvalidInputError(f"address: got {url!r}, expected http(s)://HOST:PORT")
+        parts = service_address(url)
         kind = _WholeHttpsRequests if parts.scheme == "https" else _WholeRequests
-        self._connection = kind(parts.hostname, parts.port, timeout=timeout_s)
+        self._connection = kind(parts.hostname or "", parts.port, timeout=timeout_s)
         self._where = f"{parts.scheme}://{parts.netloc.rsplit('@', 1)[-1]}"
         self._prefix = parts.path.rstrip("/")
-        self._headers = {} if api_key is None else {"Authorization": f"Bearer {api_key}"}
+        self._headers = {} if api_key is None else {"Authorization": f"Bearer {api_key.strip()}"}
         self._patience_s = patience_s
         self._pause = pause
         self._has_answered = False

@@ -128,7 +128,7 @@ class _Server:
 
     def __init__(self, url: str, api_key: str | None, timeout_s: float) -> None:
         self._url, self._timeout_s = url, timeout_s
-        self._headers = None if api_key is None else {"Authorization": f"Api-Key {api_key}"}
+        self._headers = None if api_key is None else {"Authorization": f"Api-Key {api_key.strip()}"}
         self._open = ExitStack()
         self._connection: ClientConnection | None = None
         self._worker = ThreadPoolExecutor(1, "policy_server")

@@ -52,6 +52,8 @@ SUDDEN_S = 0.2
 # It was a delay if this many arrivals return within this time; single stamps may be wrong.
 RETURN_NS = 120_000_000_000
 MIN_RETURNED = 3
+# Chosen: no path holds a sample back for so long that the next one, on time, is so far ahead.
+AHEAD_NS = 30_000_000_000
 # So many samples in a row are hardly ever all late by chance.
 NUM_BETWEEN = 5
 # What rises so near to the end of a take, and stays, is more often a delay than a stop, unless it
@@ -340,11 +342,14 @@ def find_steps(device: np.ndarray, host: np.ndarray) -> Steps:
     with that of the second after, and a step also shows in the distance of a regular device's
     stamps.
     Other rises are delays if they end within two minutes, or come in the last five seconds and are
-    below half a second; else the clock stopped. Device time that goes back is always a step.
+    below half a second; else the clock stopped. Device time that goes back, or ahead of the
+    arrivals by half a minute, is always a step.
     """
     waiting = np.zeros(len(device), dtype=bool)
     is_unsure = False
-    cuts: list[int] = (np.flatnonzero(np.diff(device) < 0) + 1).tolist()
+    steps = np.diff(device)
+    is_step = (steps < 0) | (steps - np.diff(host) > AHEAD_NS)
+    cuts: list[int] = (np.flatnonzero(is_step) + 1).tolist()
     period_ns = float(np.median(np.diff(host)))
     count = int(np.clip(CONFIRM_S * 1e9 / max(period_ns, 1.0), 5, 500))
     if len(device) > 2 * count:

@@ -10,9 +10,9 @@ import builtins
 import shutil
 import threading
 import uuid
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager, nullcontext, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -68,6 +68,8 @@ ORPHAN_AGE = timedelta(days=1)
 _PARALLEL_REQUESTS = 8
 # Listing one group takes a request, listing all of them one per 1000 objects.
 _MAX_ONE_BY_ONE = 20
+# Named in a line of the log.
+_MAX_PLACES = 10
 
 
 class ObjectFile:
@@ -290,6 +292,7 @@ class ObjectStorage:
 
     def delete(self, kind: Kind, item_id: str) -> None:
         """Delete a group: its commit record first, then its other objects."""
+        self.group(kind, item_id)
         group = group_key(kind, item_id)
         self._bucket.put(f"{group}/{CLAIM_FILE}", _DELETING)
         self._bucket.remove([f"{group}/{COMMIT_FILE}"])
@@ -433,10 +436,48 @@ def sweep_orphans(bucket: Bucket, *, now: datetime | None = None) -> int:
     """Remove objects of abandoned uploads and deletions, and return the number of groups.
 
     The whole bucket is listed. ORPHAN_AGE counts back from `now`, the present by default. Changes
-    of that age are removed, too, except the last one.
+    of that age are removed, too, except the last one. What may not be deleted stays, with one line
+    of the log.
     """
     limit = (datetime.now(UTC) if now is None else now) - ORPHAN_AGE
-    removed = 0
+    removed, refused, is_probed = 0, dict[str, StorageError](), False
+    denial: _DeletionRefusedError | None = None
+    for group, keys in _orphans(bucket, limit):
+        if denial is not None:
+            refused[group] = denial
+            continue
+        try:
+            if not is_probed:
+                # A file that is not there, to be refused before a claim is marked: that would keep
+                # what waits in an outbox from being uploaded ever.
+                with _deleting():
+                    bucket.remove([f"{group}/none"])
+                is_probed = True
+            removed += _remove_orphan(bucket, group, keys)
+        except _DeletionRefusedError as error:
+            refused[group] = denial = error
+        except StorageError as error:
+            refused[group] = error
+    changes = sorted(_announced(bucket), key=lambda facts: facts.modified)
+    try:
+        with _deleting():
+            bucket.remove([facts.key for facts in changes[:-1] if facts.modified < limit])
+    except _DeletionRefusedError as error:
+        refused[CHANGES] = denial = error
+    if refused:
+        remedy = "allow s3:DeleteObject, " if denial is not None else ""
+        logger.warning(
+            "orphans_not_removed",
+            count=len(refused),
+            places=[*refused][:_MAX_PLACES],
+            reason=(denial or next(iter(refused.values()))).message,
+            advice=f"they only take space; {remedy}the next sweep removes them",
+        )
+    return removed
+
+
+def _orphans(bucket: Bucket, limit: datetime) -> Iterator[tuple[str, list[str]]]:
+    """Groups without a commit record, and without a file since the limit, with their files."""
     for kind in KINDS:
         groups: dict[str, list[ObjectFacts]] = {}
         for facts in bucket.list(f"{kind}s"):
@@ -444,19 +485,31 @@ def sweep_orphans(bucket: Bucket, *, now: datetime | None = None) -> int:
         for group, files in groups.items():
             keys = [facts.key for facts in files]
             is_old = max(facts.modified for facts in files) < limit
-            if not is_old or f"{group}/{COMMIT_FILE}" in keys:
-                continue
-            bucket.put(f"{group}/{CLAIM_FILE}", _DELETING)
-            # It may have become active since it was listed.
-            if bucket.head(f"{group}/{COMMIT_FILE}") is None:
-                _remove_files(bucket, group, keys)
-                removed += 1
-    changes = sorted(_announced(bucket), key=lambda facts: facts.modified)
+            if is_old and f"{group}/{COMMIT_FILE}" not in keys:
+                yield group, keys
+
+
+def _remove_orphan(bucket: Bucket, group: str, keys: list[str]) -> bool:
+    """Remove a group without a commit record; False if it has one meanwhile."""
+    bucket.put(f"{group}/{CLAIM_FILE}", _DELETING)
+    # It may have become active since it was listed.
+    if bucket.head(f"{group}/{COMMIT_FILE}") is not None:
+        return False
+    with _deleting():
+        _remove_files(bucket, group, keys)
+    return True
+
+
+class _DeletionRefusedError(StorageError):
+    """What was to be deleted may not be."""
+
+
+@contextmanager
+def _deleting() -> Iterator[None]:
     try:
-        bucket.remove([facts.key for facts in changes[:-1] if facts.modified < limit])
+        yield
     except StorageError as error:
-        logger.warning("changes_not_removed", reason=error.message)
-    return removed
+        raise _DeletionRefusedError(error.message) from error
 
 
 def _announce(bucket: Bucket, group: str) -> None:

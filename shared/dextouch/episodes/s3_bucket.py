@@ -38,7 +38,8 @@ from dextouch.frozen_model import FrozenModel
 _NOT_PASSED_ON = {"allow_http", "max_retries", "retry_timeout_s", "cache_bytes", "work_folder"}
 # The library puts the status code in the message where it has no exception class for it.
 _STATUS = re.compile(r"status code: (\d{3})")
-_CODE = re.compile(r"<Code>(\w+)</Code>")
+# The latter of one of several objects, whose answer as a whole has the status 200.
+_CODE = re.compile(r"(?:<Code>|\(code: )(\w+)")
 _CREDENTIAL_HOST = "169.254.16"
 _SECRETS = frozenset({"access_key_id", "secret_access_key", "session_token"})
 
@@ -322,7 +323,7 @@ class Bucket:
                 f"{what}: no credentials; set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or the "
                 "storage options access_key_id and secret_access_key"
             )
-        if denied or number in {401, 403}:
+        if denied or number in {401, 403} or (code is not None and code[1] == "AccessDenied"):
             return StorageError(
                 f"{what}: refused ({said}); check the credentials, what they may do, and the region"
             )

@@ -315,9 +315,10 @@ class EpisodeStore:
     def delete(self, item_id: str, *, kind: Kind = "episode", for_good: bool = False) -> None:
         """Move an item to the trash, or delete it `for_good`, as always in object storage.
 
-        Raises NotFoundError without the id.
+        Also what is left in a folder of one that lost its commit record. Raises NotFoundError
+        without the id.
         """
-        self._storage.group(*_check(kind, item_id))
+        _check(kind, item_id)
         if for_good or not isinstance(self._storage, _LocalStorage):
             self._storage.delete(kind, item_id)
         else:

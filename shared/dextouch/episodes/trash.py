@@ -65,10 +65,11 @@ def put_into_trash(root: Path, kind: TrashKind, item_id: str, *, now_ns: int | N
     home = root / _home(kind)
     number = time.time_ns() if now_ns is None else now_ns
     with disk_errors(f"delete {kind} {item_id}"):
-        (root / TRASH).mkdir(parents=True, exist_ok=True)
         while (place := root / TRASH / f"{kind}.{item_id}.{number}").exists():
             number += 1
         try:
+            (home / item_id).lstat()
+            place.parent.mkdir(parents=True, exist_ok=True)
             (home / item_id).rename(place)
         except FileNotFoundError as error:
             raise NotFoundError(f"{kind} {item_id!r}: not in the store {root}") from error

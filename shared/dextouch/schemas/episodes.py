@@ -34,8 +34,9 @@ SHARED_ATTRIBUTES: Final = (
 )  # fmt: skip
 # Characters of the reason why a take is incomplete.
 MAX_CAUSE = 500
-# Characters of the parameters of an edit: room for two instructions, quoted.
-MAX_OPERATION = 8000
+# Characters of the parameters of an edit: room for an instruction and a task of apostrophes alone,
+# for each of which a shell needs five.
+MAX_OPERATION = 12_000
 RIGID_TOLERANCE: Final = 1e-6
 # Reason of the store's ConflictError when another recording has the id.
 ID_TAKEN = "id_taken"

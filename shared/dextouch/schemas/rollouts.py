@@ -6,6 +6,7 @@ from typing import Final, Literal
 
 from pydantic import ConfigDict, Field, model_validator
 
+from dextouch.errors import InvalidInputError
 from dextouch.free_text import FreeText
 from dextouch.frozen_model import FrozenModel, example
 from dextouch.schemas.common import MAX_INSTRUCTION
@@ -96,6 +97,14 @@ class WorldDescription(FrozenModel):
     def num_taxels(self) -> int:
         """Taxels of one hand in observations."""
         return _USUAL_TAXELS if self.tactile_layout is None else self.tactile_layout.num_taxels
+
+    def check_rate(self, rate_hz: float, *, of: str) -> None:
+        """Refuse steps at another rate, by InvalidInputError; `of` says whose they are."""
+        if rate_hz != self.model_rate_hz:
+            raise InvalidInputError(
+                f"world {self.name!r}: got {of} at {rate_hz:g} steps a second, expected "
+                f"{self.model_rate_hz:g}; align or import episodes at the rate of the world"
+            )
 
 
 class WorldList(FrozenModel):

@@ -22,6 +22,7 @@ from .guard import MSGPACK as MSGPACK
 from .guard import OCTETS as OCTETS
 from .guard import JsonBody as JsonBody
 from .guard import RequireScope as RequireScope
+from .guard import close_reason as close_reason
 from .guard import decoded as decoded
 from .guard import header as header
 from .guard import media_type as media_type

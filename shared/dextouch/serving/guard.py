@@ -9,7 +9,6 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from email.message import Message
 from functools import cached_property, lru_cache
 from http import HTTPStatus
 from typing import Generic, TypeVar
@@ -23,8 +22,7 @@ from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 from starlette.requests import HTTPConnection, Request
 from starlette.responses import PlainTextResponse, Response
-from starlette.types import ASGIApp, Receive, Scope, Send
-from starlette.types import Message as AsgiMessage
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from dextouch.errors import AccessDeniedError, DexTouchError, InvalidInputError
 from dextouch.schemas import MAX_NAMED, first_problems, status_of
@@ -56,6 +54,11 @@ EndpointT = TypeVar("EndpointT", bound=Callable[..., object])
 # Whether a request without a key comes from a signed-in browser.
 Admits = Callable[[HTTPConnection], bool]
 Refuse = Callable[[Request, DexTouchError | HTTPException], Response]
+
+
+def close_reason(message: str) -> str:
+    """As much of a message as the close frame of a WebSocket holds (RFC 6455, section 5.5)."""
+    return message.encode()[:MAX_REASON_BYTES].decode(errors="ignore")
 
 
 def header(scope: Scope, name: bytes) -> str | None:
@@ -176,16 +179,11 @@ def body_rule(endpoint: Callable[..., object]) -> BodyRule | None:
 def media_type(content_type: str | None) -> tuple[str, dict[str, str]]:
     """A Content-Type's media type and parameters in lower case; "none" where there is none.
 
-    Extended parameters (`name*=charset'language'value`) are ignored.
+    Values end at a semicolon also within quotes: no parameter that is read may have one.
     """
-    header = Message()
-    header["content-type"] = content_type or "none/none"
-    parameters = {
-        name.lower(): value.lower()
-        for name, value in header.get_params() or []
-        if isinstance(value, str)
-    }
-    return (header.get_content_type() if content_type else "none"), parameters
+    kind, *given = [part.strip() for part in (content_type or "none").lower().split(";")]
+    pairs = (parameter.partition("=") for parameter in given)
+    return kind, {name.strip(): value.strip().strip('"') for name, _, value in pairs}
 
 
 @dataclass(frozen=True)
@@ -236,7 +234,7 @@ class BodyRules:
                 # Starlette's own class, since FastAPI turns any other into a 400.
                 raise HTTPException(413, f"body: got {num_bytes} bytes, expected at most {limit}")
 
-        async def limited() -> AsgiMessage:
+        async def limited() -> Message:
             nonlocal received, is_complete
             message = await receive()
             if message["type"] == "http.disconnect" and not is_complete:
@@ -309,7 +307,7 @@ class GuardMiddleware:
             waits = {"retry-after": str(error.details["retry_after_s"])}
             await PlainTextResponse(error.message, status, waits)(scope, receive, send)
             return
-        reason = error.message.encode()[:MAX_REASON_BYTES].decode(errors="ignore")
+        reason = close_reason(error.message)
         await send({"type": "websocket.close", "code": POLICY_VIOLATION, "reason": reason})
 
     def _check_sender(self, scope: Scope, *, needs_key: bool, is_unsafe: bool) -> None:

@@ -181,7 +181,8 @@ def _open_grant(scope: str) -> Grant:
 
 def secret_digest(text: str) -> bytes:
     """By which keys and tokens are compared and kept."""
-    return hashlib.sha256(text.encode()).digest()
+    # JSON can hold halves of UTF-16 pairs, which are no valid key.
+    return hashlib.sha256(text.encode(errors="surrogatepass")).digest()
 
 
 def presented_key(authorization: str | None) -> str | None:

@@ -6,7 +6,7 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from dextouch.hands import CHAINS, chain_indices
+from dextouch.hands import CHAINS, NUM_KEYPOINTS, chain_indices
 from dextouch.tactile.layout import FINGERS, SIDES, TactileLayout
 
 BIN_NS: Final = 500_000_000
@@ -41,6 +41,8 @@ class HandTraces:
     def __init__(self, num_bins: int | None = None) -> None:
         self._num_bins = num_bins
         self._bins: dict[str, dict[int, np.ndarray]] = defaultdict(dict)
+        # The last quaternion of each wrist.
+        self._last: dict[str, np.ndarray] = {}
 
     def add(
         self,
@@ -49,21 +51,30 @@ class HandTraces:
         values: np.ndarray,
         layout: TactileLayout | None = None,
     ) -> None:
-        """Samples of keypoints (m), of a wrist's poses, or of the pressures (kPa) of a layout."""
+        """Samples of keypoints (m), of a wrist's poses, or of the pressures (kPa) of a layout.
+
+        Keypoints that are not our 25, and wrists that are not single poses, say nothing.
+        """
         rows = np.asarray(values, dtype=np.float64)
         if layout is not None:
             rows = layout.pad_forces_n(np.nan_to_num(rows))
         if name.startswith("keypoints"):
+            if rows.shape[1:] != (NUM_KEYPOINTS, 3):
+                return
             ends = [(chain_indices(chain)[0], chain_indices(chain)[-1]) for chain in CHAINS]
             rows = np.stack([np.linalg.norm(rows[:, b] - rows[:, a], axis=1) for a, b in ends], 1)
-        elif name.startswith("wrist"):
-            rows = rows * np.where(np.arange(7) > 2, np.where(rows[:, 3:4] < 0, -1, 1), 1)
+        if name.startswith("wrist") and rows.shape[1:] != (7,):
+            return
         known = np.isfinite(rows).all(axis=1)
+        rows = rows[known]
+        if name.startswith("wrist") and len(rows):
+            # Of the two quaternions of a rotation the one nearer to those before.
+            away = rows[:, 3:] @ self._last.get(name, rows[0, 3:]) < 0
+            rows[away, 3:] *= -1
+            self._last[name] = rows[-1, 3:].copy()
         numbers, inverse = np.unique(t_ns[known] // BIN_NS, return_inverse=True)
         sums = np.zeros((len(numbers), 1 + 2 * rows.shape[1]))
-        np.add.at(
-            sums, inverse, np.hstack([np.ones((known.sum(), 1)), rows[known], rows[known] ** 2])
-        )
+        np.add.at(sums, inverse, np.hstack([np.ones((len(rows), 1)), rows, rows**2]))
         bins = self._bins[name]
         for number, row in zip(numbers.tolist(), sums, strict=True):
             bins[number] = bins.get(number, 0.0) + row

@@ -37,7 +37,7 @@ def pack(fields: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> bytes:
     """Serialize JSON-like fields and arrays (little endian, C order); raises InvalidInputError."""
     packed = {}
     for name, array in arrays.items():
-        ordered = np.ascontiguousarray(array)
+        ordered = np.asarray(array, order="C")
         dtype = _NAMES.get(ordered.dtype)
         if dtype is None:
             dtype = ordered.dtype.name

@@ -40,8 +40,9 @@ PUMPED: Final = 0.04
 MIN_PUMPED: Final = 2
 
 
-def thumbnail(image: UInt8[np.ndarray, "h w c"]) -> Float32[np.ndarray, "24 32"]:
+def thumbnail(image: UInt8[np.ndarray, "h w *c"]) -> Float32[np.ndarray, "24 32"]:
     """Mean levels of blocks of an image: of its green, or of its only channel."""
+    image = image.reshape(*image.shape[:2], -1)
     rows, columns = (
         (2 * np.arange(count * _SAMPLES) + 1) * size // (2 * count * _SAMPLES)
         for count, size in zip(PICTURE_SHAPE, image.shape, strict=False)

@@ -82,7 +82,7 @@ def implausible_values(
     Times increase. Only the unit is checked of what is commanded. What is `of_robot` may rest
     exactly; joints and poses in a robot's base always may.
     """
-    if descriptor.kind == "pose":
+    if descriptor.kind == "pose" and descriptor.shape == (7,):
         can_rest = of_robot or descriptor.frame == "base"
         period_ns = descriptor.period_ns()
         found = implausible_poses(t_ns, values, period_ns=period_ns, can_rest=can_rest)
@@ -91,7 +91,9 @@ def implausible_values(
         found = list(implausible_repeats(values, what="keypoints", may_lock=True))
         if values.shape[1:] == (NUM_KEYPOINTS, 3):
             found += _frozen_nodes(values, found)
-    elif descriptor.kind == "robot_state" and descriptor.unit == "rad":
+    elif descriptor.kind == "robot_state" and (
+        descriptor.unit == "rad" or descriptor.name.startswith("joints_")
+    ):
         lower_rad, upper_rad = _limits_rad()
         if values.shape[1:] != lower_rad.shape:
             return []

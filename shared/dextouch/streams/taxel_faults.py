@@ -36,12 +36,17 @@ MAX_DIPS_SHARE: Final = 0.02
 MIN_NOISE_SHARE: Final = 0.2
 NOISY_TAXELS: Final = 0.5
 # A taxel is deaf that stays the same within noise in almost all of so many windows in which so many
-# of its neighbours moved by more.
+# of its neighbours moved by more, and in almost all of the take. What is hard has gaps as sharp as
+# that (between two ridges, inside a ring), but its outlines are as sharp: half of the taxels beside
+# it, of whose neighbours fewer moved, stay the same as well. Of what spreads by half a taxel 8 %
+# do.
 MIN_MOVE_KPA: Final = 5.0
 MAX_SILENT_KPA: Final = 0.5
 NEIGHBOUR_SHARE: Final = 0.75
 MIN_ASKED: Final = 2
 SILENT_SHARE: Final = 0.95
+BESIDE_SHARES: Final = (0.25, 0.6)
+MAX_SHARP_SHARE: Final = 0.5
 
 
 def neighbour_share(
@@ -99,9 +104,10 @@ class TaxelFaults:
         self.blocks = TaxelBlocks(
             gain_counts_per_kpa, usable=self._usable, step=step, layout=layout
         )
-        zeros = np.zeros((10, num_taxels))
+        zeros = np.zeros((11, num_taxels))
         self._finite, self._below, self._rest, self._kept, self._longest, self._random = zeros[:6]
-        self._turns, self._dips, self._asked, self._silent = zeros[6:]
+        self._turns, self._dips, self._asked, self._silent, self._moved = zeros[6:]
+        self._num_beside = self._num_silent_beside = 0
 
     def add(self, counts: Float64[np.ndarray, "time taxels"]) -> None:
         """The next readings; nothing is judged of a glove without a usable taxel."""
@@ -174,13 +180,22 @@ class TaxelFaults:
         self._keys.append((bits * (places | np.uint64(1))).sum(axis=1, dtype=np.uint64))
 
     def _note_silent(self, offsets: Float64[np.ndarray, "time taxels"]) -> None:
-        """Count windows in which a taxel's neighbours move, and those in which it does not."""
+        """Count windows in which a taxel or its neighbours move, and how sharp contacts are."""
         if len(offsets) < MIN_SAMPLES_TO_JUDGE:
             return
         range_kpa = np.ptp(np.nan_to_num(offsets), axis=0) / self._gain
-        asked = neighbour_share(range_kpa >= MIN_MOVE_KPA, self._layout) >= NEIGHBOUR_SHARE
+        moved = range_kpa >= MIN_MOVE_KPA
+        around = neighbour_share(moved, self._layout)
+        asked = around >= NEIGHBOUR_SHARE
         self._asked += asked
         self._silent += asked & (range_kpa < MAX_SILENT_KPA)
+        self._moved += range_kpa >= MAX_SILENT_KPA
+        # A taxel that moves alone is no contact.
+        around = neighbour_share(moved & (around > 0), self._layout)
+        beside = (around > BESIDE_SHARES[0]) & (around < BESIDE_SHARES[1])
+        beside_kpa = range_kpa[beside & self._usable & ~moved]
+        self._num_beside += len(beside_kpa)
+        self._num_silent_beside += int((beside_kpa < MAX_SILENT_KPA).sum())
         lows_kpa = np.sort((np.nan_to_num(offsets).min(axis=0) / self._gain)[self._usable])
         # What presses on the hand leaves one of ten taxels alone.
         self._zeros_kpa.append(float(lows_kpa[len(lows_kpa) // 10]))
@@ -219,7 +234,10 @@ class TaxelFaults:
         is_below = self._below > n / 2
         silent |= self._ended() & ~(is_below & (self._last != 0))
         is_loose = (self._dips > MAX_DIPS_SHARE * n) & ~is_below
-        is_deaf = (self._asked >= MIN_ASKED) & (self._silent >= SILENT_SHARE * self._asked)
+        is_still = self._moved <= (1 - SILENT_SHARE) * self._num_windows
+        is_deaf = is_still & (self._asked >= MIN_ASKED)
+        is_deaf &= self._silent >= SILENT_SHARE * self._asked
+        is_deaf &= self._num_silent_beside <= MAX_SHARP_SHARE * self._num_beside
         return {
             "absent": 1.0 - self._finite / n > MAX_MISSING,
             "random": (self._random > MIN_RANDOM_SHARE * self._num_windows) | is_loose,

@@ -21,7 +21,8 @@ from dextouch.schemas import (
     start_of_parts,
     validate_fields,
 )
-from dextouch.serving import MAX_WEBSOCKET_BYTES, accept_messages_of, decoded
+from dextouch.serving import MAX_WEBSOCKET_BYTES, AccessControl, accept_messages_of, decoded
+from dextouch.serving.guard import close_reason
 from dextouch.streams import pack_openpi, unpack, unpack_openpi
 from dextouch.worlds.records import Answer
 from dextouch.worlds.rollouts import RolloutService
@@ -56,11 +57,12 @@ def openpi_router(service: RolloutService) -> APIRouter:
 
     @router.websocket("/openpi")
     async def openpi(socket: WebSocket) -> None:
+        access: AccessControl = socket.app.state.access
+        authorization = socket.headers.get("authorization")
         try:
-            authorization = socket.headers.get("authorization")
-            owner = socket.app.state.access.check(authorization, SCOPE)
+            owner = access.check(authorization, SCOPE)
         except DexTouchError as error:
-            await socket.close(_REFUSED, error.message[:120])
+            await socket.close(_REFUSED, close_reason(error.message))
             return
         await socket.accept()
         described = service.worlds()
@@ -73,6 +75,8 @@ def openpi_router(service: RolloutService) -> APIRouter:
             await socket.send_bytes(pack_openpi({"worlds": worlds, "action_dim": ACTION_DIM}))
             while (message := await socket.receive())["type"] == "websocket.receive":
                 try:
+                    # It may have been removed since.
+                    access.check(authorization, SCOPE)
                     answer = await session.answer(message.get("bytes"))
                 except DexTouchError as error:
                     await socket.send_text(error.message)

@@ -17,7 +17,8 @@ class RolloutLimits(FrozenModel):
     ttl_s: float = Field(
         default=600.0,
         gt=0,
-        description="seconds until an unused rollout expires; every chunk restarts them",
+        lt=1e9,
+        description="seconds until an unused rollout expires; every chunk restarts them; below 1e9",
     )
 
 

@@ -20,7 +20,7 @@ from services.acquisition.drivers.packets import SOURCES, VERSION, Packet, encod
 from services.acquisition.health.glove_records import is_ours
 from services.acquisition.settings import AcquisitionSettings
 from services.acquisition.station import LiveView
-from services.acquisition.transports import SerialTransport
+from services.acquisition.transports import SerialTransport, tcp_transport
 
 IDS = {"vendor_id": 1, "product_id": 2}
 
@@ -163,3 +163,8 @@ def test_a_tracker_elsewhere_says_that_it_sits_on_no_wrist():
     np.testing.assert_allclose(sample.values, [0.1, 0.2, 0.3, 1, 0, 0, 0], rtol=1e-6)
     with pytest.raises(DeviceError, match="says it is 'left', expected 'none'"):
         pose_from("left")
+
+
+def test_a_host_that_has_no_name_is_absent():
+    with pytest.raises(DeviceError, match=r"socket glove\.\.lab:1: cannot be opened"):
+        tcp_transport("glove..lab", 1).open()

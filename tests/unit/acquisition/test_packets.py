@@ -211,6 +211,15 @@ def test_magic_inside_the_payload_is_payload():
     assert statistics.resync_bytes == 0
 
 
+def test_a_stamp_that_no_batch_can_hold_is_held_back(rng):
+    decoder = TactileGloveDecoder("left")
+    data = b"".join(
+        glove_packet(n, rng, boot_ns=b) for n, b in ((1, 5), (2, 2**63), (3, 2**63 - 4))
+    )
+    assert [sample.t_device_ns for sample in decoder.feed(data)] == [6, 2**63 - 1]
+    assert (decoder.statistics.suspects, decoder.statistics.lost) == (1, 1)
+
+
 @pytest.mark.parametrize(("version", "source", "words"), [(2, 1, "version 2"), (1, 2, "'right'")])
 def test_foreign_glove_is_refused(rng, version, source, words):
     data = glove_packet(0, rng, version=version, source=source)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dextouch.episodes.spool import SpoolReader
-from dextouch.errors import ConflictError, InvalidInputError, UnavailableError
+from dextouch.errors import ConflictError, InvalidInputError, StorageError, UnavailableError
 from dextouch.schemas import SaveTake, TakePrompt
 from dextouch.streams import Sample
 from services.acquisition.clock import VirtualClock
@@ -17,6 +17,8 @@ from services.acquisition.devices.tactile_glove import TactileGloveDecoder
 from services.acquisition.drivers.base import Driver
 from services.acquisition.mocks.ports import HidPort, PtyPort
 from services.acquisition.recorder import CALIBRATION, Recorder
+from services.acquisition.retention import spooled_takes
+from services.acquisition.uploader import recover_spool
 from services.alignment.station_calibration import glove, runs
 
 PROMPT = TakePrompt(task="stand_bottle", instruction="stand the bottle up", consent=True)
@@ -136,6 +138,30 @@ def test_discarded_takes_leave_nothing(recorder, clock, tmp_path):
     take(recorder, clock)
     assert recorder.discard().state == "discarded"
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_discarded_take_does_not_come_back_however_its_removal_ends(
+    recorder, clock, tmp_path, monkeypatch
+):
+    def fail(path, **_):
+        if path.exists():
+            raise OSError(errno.EIO, "a bad sector")
+
+    take(recorder, clock)
+    monkeypatch.setattr(shutil, "rmtree", fail)
+    with pytest.raises(StorageError):
+        recorder.discard()
+    monkeypatch.undo()
+    # As after a kill in between.
+    assert spooled_takes(tmp_path) == []
+    assert recorder.discard().state == "discarded"
+    assert recover_spool(tmp_path) == []
+    assert list((tmp_path / ".removed").iterdir()) == []
+
+
+def test_a_take_that_was_removed_by_hand_can_be_discarded(recorder, clock, tmp_path):
+    shutil.rmtree(tmp_path / take(recorder, clock).recording_id)
+    assert recorder.rerecord().state == "armed"
 
 
 def test_missing_stream_is_named_and_not_saved_unasked(recorder, clock):

@@ -2,6 +2,7 @@
 
 import os
 import shutil
+from pathlib import Path
 
 import pytest
 from prometheus_client import CollectorRegistry
@@ -99,6 +100,19 @@ def test_an_interrupted_removal_leaves_no_take_and_is_completed(tmp_path, monkey
     assert len(list((tmp_path / ".removed").iterdir())) == 1
     assert swept(tmp_path) == []
     assert list((tmp_path / ".removed").iterdir()) == []
+
+
+def test_a_removal_that_a_sweep_completes_first_is_no_failure(tmp_path, monkeypatch):
+    take(tmp_path, "a", age_days=8)
+    rename = Path.rename
+
+    def rename_and_sweep(path, target):
+        rename(path, target)
+        retention_module.empty_removed(tmp_path)
+
+    monkeypatch.setattr(Path, "rename", rename_and_sweep)
+    retention_module.remove_take(tmp_path / "a")
+    assert [path.name for path in tmp_path.rglob("*")] == [".removed"]
 
 
 def test_metrics_show_the_spools_use_and_the_limits(tmp_path):

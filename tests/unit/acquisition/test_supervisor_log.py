@@ -2,7 +2,7 @@
 
 from structlog.testing import capture_logs
 
-from dextouch.errors import DeviceError
+from dextouch.errors import DeviceError, PacketError
 from services.acquisition.clock import StationClock, Waiter
 from services.acquisition.devices.pose_tracker import PoseTrackerDecoder
 from services.acquisition.drivers.base import Driver
@@ -41,6 +41,16 @@ class Waits(StationClock, Waiter):
         pass
 
 
+class Broken(Driver):
+    """A device whose driver has a mistake, or whose firmware says what there is not."""
+
+    num_opened = 0
+
+    def open(self):
+        self.num_opened += 1
+        raise (PacketError if self.num_opened > 600 else RuntimeError)("head: impossible")
+
+
 class Absent(Driver):
     """A device that says in turn why it is not there."""
 
@@ -52,9 +62,9 @@ class Absent(Driver):
         raise DeviceError(self.messages[self.num_opened * len(self.messages) // 1000])
 
 
-def losses(num_waits, messages=Absent.messages):
+def lines(num_waits, kind=Absent, messages=Absent.messages):
     clock = Waits(num_waits)
-    driver = Absent(
+    driver = kind(
         "head",
         transport=HidPort("head").transport,
         decoder=PoseTrackerDecoder("head"),
@@ -65,6 +75,11 @@ def losses(num_waits, messages=Absent.messages):
     with capture_logs() as logs:
         clock.supervisor._run()
     assert driver.num_opened == num_waits
+    return logs
+
+
+def losses(num_waits, messages=Absent.messages):
+    logs = lines(num_waits, messages=messages)
     return [(e["error"], e["count"]) for e in logs if e["event"] == "lose_device"]
 
 
@@ -80,6 +95,16 @@ def test_another_reason_is_logged_at_once():
         ("gone", 301),
         ("no permission", 1),
         ("no permission", 301),
+    ]
+
+
+def test_a_driver_that_fails_is_logged_as_rarely():
+    logs = lines(900, kind=Broken)
+    # Two minutes of a mistake, with its traceback, and one of what the device says.
+    told = [("fail_device", "error", 1), ("fail_device", "error", 301)]
+    assert [(e["event"], e["log_level"], e["count"]) for e in logs] == [
+        *told,
+        ("lose_device", "warning", 1),
     ]
 
 

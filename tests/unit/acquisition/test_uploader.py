@@ -2,10 +2,12 @@ import errno
 import os
 import shutil
 import socket
+import threading
 from datetime import UTC, datetime, timedelta
 
 import numpy as np
 import pytest
+from structlog.testing import capture_logs
 
 from dextouch.clients import EpisodeStoreClient
 from dextouch.episodes.spool import SpoolReader, SpoolWriter
@@ -337,6 +339,63 @@ def test_thread_uploads_and_stops(tmp_path):
     assert store.is_closed
 
 
+def test_a_mistake_does_not_end_the_uploads(tmp_path, monkeypatch):
+    uploader = Uploader(tmp_path, FakeStore(), period_s=0.01)
+    monkeypatch.setattr(uploader.retention, "sweep", lambda: 1 / 0)
+    uploader.start()
+    for name in ("a", "b"):
+        spool(tmp_path, name)
+        while not (tmp_path / name / UPLOADED_FILE).exists():
+            assert uploader._thread.is_alive()
+            uploader._stopping.wait(0.005)
+    uploader.stop()
+
+
+def test_a_mistake_with_one_take_keeps_no_other_here(tmp_path, monkeypatch):
+    for name in ("a", "b"):
+        spool(tmp_path, name)
+    store, create = FakeStore(), FakeStore.create
+
+    def begin(self, attributes):
+        if attributes.recording_id == "a":
+            raise KeyError("offset")
+        return create(self, attributes)
+
+    monkeypatch.setattr(FakeStore, "create", begin)
+    uploader = Uploader(tmp_path, store, period_s=1.0)
+    with capture_logs() as logs:
+        assert uploader.upload_all() == ["b"]
+        assert uploader.upload_all() == []
+    assert [(log["event"], log["recording_id"]) for log in logs if log["log_level"] == "error"] == [
+        ("fail_upload", "a")
+    ]
+    assert "KeyError('offset')" in uploader.status_of("a").error
+    monkeypatch.setattr(FakeStore, "create", create)
+    assert uploader.upload_all() == ["a"]
+    assert uploader.status_of("a").error is None
+
+
+def test_space_is_made_though_the_uploads_fail(tmp_path, monkeypatch):
+    uploader, swept = Uploader(tmp_path, FakeStore(), period_s=0.01), threading.Event()
+    monkeypatch.setattr(uploader, "upload_all", lambda: 1 / 0)
+    monkeypatch.setattr(uploader.retention, "sweep", swept.set)
+    uploader.start()
+    assert swept.wait(10)
+    uploader.stop()
+
+
+def test_a_store_is_asked_again_after_an_hour_at_most(tmp_path, monkeypatch):
+    def refuse(_):
+        raise UnavailableError("store: away", retry_after_s=10**12)
+
+    spool(tmp_path)
+    store = FakeStore()
+    monkeypatch.setattr(store, "create", refuse)
+    uploader = Uploader(tmp_path, store, period_s=1.0)
+    assert uploader.upload_all() == []
+    assert uploader._retry_after_s == 3600.0
+
+
 def test_no_connection_outlives_the_uploads(tmp_path):
     spool(tmp_path)
     with socket.create_server(("127.0.0.1", 0)) as server:
@@ -377,6 +436,16 @@ def test_batches_of_large_images_are_small():
     image = STREAMS[0].model_copy(update={"shape": (480, 640, 3), "dtype": "uint8"})
     assert batch_samples(image) == 9
     assert batch_samples(STREAMS[0]) == 120
+
+
+def test_a_note_that_cannot_be_read_does_not_end_the_uploads(tmp_path):
+    # As on a bad sector, or of another user.
+    (spool(tmp_path, "a") / UPLOADED_FILE).mkdir()
+    spool(tmp_path, "b")
+    uploader = Uploader(tmp_path, FakeStore(), period_s=1.0)
+    assert uploader.upload_all() == ["b"]
+    assert "note the upload of 'a'" in uploader.status()[0].error
+    assert uploader.counts() == {"waiting": 1, "uploaded": 1, "refused": 0}
 
 
 def test_a_damaged_take_does_not_keep_the_others(tmp_path):

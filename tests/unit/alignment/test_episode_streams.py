@@ -13,7 +13,7 @@ from services.alignment.jobs import align_recording
 from services.alignment.settings import AlignmentOptions
 from services.alignment.synchronization import recorded_streams
 from tests.system.long_take import encode_images
-from tests.unit.alignment.recordings import START_NS, write_recording
+from tests.unit.alignment.recordings import POSE, START_NS, write_recording
 
 IMAGES = encode_images()
 OPTIONS = AlignmentOptions()
@@ -122,6 +122,43 @@ def test_a_group_with_an_image_that_has_no_time_is_encoded_anew(store):
     before = store.recording(name).images("camera_head", number, number + 1)
     after = episode.images("camera_head", len(stamps) - 1)
     assert np.abs(before.astype(float) - after).mean() < 4
+
+
+def moving_stripes(shape, dtype, level):
+    """90 images whose upper rows change at once in every third one."""
+    rows = level + 0.2 * level * np.sin(np.arange(shape[0])[:, None] + np.arange(90)[:, None, None])
+    rows[::3, :80] = 0.4 * level
+    return np.broadcast_to(rows, (90, *shape)).astype(dtype)
+
+
+@pytest.mark.parametrize(
+    ("kind", "unit", "values"),
+    [
+        ("image", "mono8", moving_stripes((240, 320), "uint8", 100)),
+        ("image", "mono16", moving_stripes((240, 320), "uint16", 800)),
+        ("image", "m", moving_stripes((240, 320), "float32", 0.8)),
+        ("pose", "pose_m_wxyz", np.tile(POSE, (90, 1, 1))),
+        ("pose", "pose_m_wxyz", np.tile(POSE, (90, 5, 1))),
+    ],
+    ids=["gray", "depth in mm", "depth in m", "one pose in a list", "poses"],
+)
+def test_streams_of_other_programs_are_taken_over_as_they_are(tmp_path, kind, unit, values):
+    store = EpisodeStore(tmp_path)
+    write_recording(store, "take", seconds=3.0)
+    stream = StreamDescriptor(
+        name="more", kind=kind, shape=values.shape[1:], dtype=values.dtype.name, unit=unit,
+        nominal_rate_hz=30,
+    )  # fmt: skip
+    old = store.recording("take")
+    attributes = old.attributes.model_copy(update={"recording_id": "foreign", "streams": ()})
+    with store.writer(kind="recording", attributes=attributes) as writer:
+        for name, one in old.streams.items():
+            writer.add_stream(one)
+            writer.append(name, values=old.read(name).values, t_host_ns=old.read(name).t_host_ns)
+        writer.add_stream(stream)
+        writer.append("more", values=values, t_host_ns=camera_times_ns(90))
+    episode = store.open(align_recording(store, "foreign", OPTIONS).episode_id)
+    np.testing.assert_array_equal(episode.read("more").values, values)
 
 
 def test_pieces_of_any_size_give_the_same_episode(tmp_path, monkeypatch):

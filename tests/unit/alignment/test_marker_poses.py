@@ -93,6 +93,14 @@ def errors(found, true):
     return way_mm, np.rad2deg(rotation_angle(found[:3, :3].T @ true[:3, :3]))
 
 
+def test_gray_images_show_the_same():
+    one, true = cube(), seen_from_above(0.3)
+    image = photo(true, one)
+    found, *others = (tracked(one, [seen]) for seen in (image, image[..., 0], image[..., :1]))
+    for other in others:
+        np.testing.assert_array_equal(other.Ts_world_object, found.Ts_world_object)
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("distortion", [NO_DISTORTION, DISTORTION], ids=["pinhole", "lens"])
 @pytest.mark.parametrize("yaw_rad", [-0.4, 0.0, 0.3])

@@ -14,8 +14,8 @@ from dextouch.episodes import EpisodeStore
 from dextouch.errors import ClockFitError, InvalidInputError
 from dextouch.geometry import pose_from_transform
 from dextouch.images import encode_jpeg
-from dextouch.schemas import matrix_rows
-from dextouch.streams import NO_SEQUENCE, ClockCapabilities
+from dextouch.schemas import RecordingAttributes, matrix_rows
+from dextouch.streams import NO_SEQUENCE, ClockCapabilities, StreamDescriptor
 from services.alignment.calibration.tactile_tare import (
     BELOW_TARE,
     DEAD,
@@ -29,7 +29,7 @@ from services.alignment.calibration.tactile_tare import (
 from services.alignment.command_line import WHY, report_line, report_page
 from services.alignment.jobs import align_recording
 from services.alignment.settings import AlignmentOptions
-from services.alignment.synchronization.episode_builder import check_bodies
+from services.alignment.synchronization.episode_builder import check_bodies, check_hand_traces
 from services.alignment.synchronization.recorded_streams import date_stream
 from services.alignment.synchronization.resampling import RefusedReason
 from services.alignment.synchronization.stream_clock import time_stream
@@ -180,6 +180,25 @@ def dated(folder, domain, fault):
     )
     recording = store.recording("take")
     return {name: date_stream(recording, name) for name in recording.streams}, domain
+
+
+def test_streams_with_names_like_those_of_hands_say_nothing_of_hands(tmp_path):
+    store, names = EpisodeStore(tmp_path), ("keypoints_left", "keypoints_cup", "tactile_thumb")
+    attributes = RecordingAttributes(
+        recording_id="take", task="t", instruction="", domain="human", station="s"
+    )
+    with store.writer(kind="recording", attributes=attributes) as writer:
+        for name, kind, shape in zip(
+            names, ("keypoints", "keypoints", "scalar"), ((25, 3), (10, 3), ()), strict=True
+        ):
+            stream = StreamDescriptor(
+                name=name, kind=kind, shape=shape, dtype="float64", unit="m", nominal_rate_hz=100
+            )
+            writer.add_stream(stream)
+            t_ns = np.arange(600) * 10_000_000
+            writer.append(name, values=np.zeros((600, *shape)), t_host_ns=t_ns)
+    recording = store.recording("take")
+    check_hand_traces({name: date_stream(recording, name) for name in names})
 
 
 def swapped(poses):

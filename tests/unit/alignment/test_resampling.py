@@ -41,6 +41,28 @@ def test_a_stream_goes_on_for_one_and_a_half_periods_at_its_ends():
     np.testing.assert_allclose(values[at.valid], [-30, -2, 0, 8, 20, 40, 70], atol=1e-9)
 
 
+@pytest.mark.parametrize("times_ms", [[0, 10, 20, 20.01], [0, 0.01, 10, 20]])
+def test_samples_that_came_in_a_burst_lead_nowhere_far_at_the_ends(times_ms):
+    """1 mm within 10 µs is no speed: beyond the ends at most as in half a period."""
+    t_ns = (np.array(times_ms) * MS).astype(np.int64)
+    grid_ns = np.array([t_ns[0] - 15 * MS, t_ns[-1] + 15 * MS])
+    at = place_on_grid(t_ns, grid_ns, period_ns=10 * MS, max_gap_ns=30 * MS)
+    assert at.valid.all()
+    values = vectors_on_grid(np.array([[0.0], [1.0], [2.0], [3.0]]), at)[:, 0]
+    before, after = (1.5, 3.0) if times_ms[-1] > 20 else (3.0, 1.5)
+    np.testing.assert_allclose(values, [-before, 3 + after], atol=1e-9)
+
+
+def test_a_stream_that_is_faster_than_declared_goes_on_along_its_line():
+    """Declared 30 Hz, sent each 11 ms, 16 ms beyond the end: 1 + 16 / 11 spans."""
+    t_ns = np.arange(10) * 11 * MS
+    at = place_on_grid(
+        t_ns, t_ns[-1:] + 16 * MS, period_ns=round(1e9 / 30), max_gap_ns=round(2.5e9 / 30)
+    )
+    assert at.valid.all()
+    np.testing.assert_allclose(at.weight, [1 + 16 / 11], atol=1e-12)
+
+
 def test_a_pose_between_two_samples_has_its_share_of_both():
     """From 0 to 1 m and from 0 to 80 degrees about z, at a quarter and at three quarters."""
     half_rad = np.deg2rad(40)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from dextouch.errors import InvalidInputError
 from dextouch.schemas import ClockReport
 from dextouch.streams import ClockCapabilities, SampleBatch, StreamDescriptor
 from services.alignment.command_line import report_line, report_page
@@ -150,3 +151,44 @@ def test_reports_of_older_episodes_load():
     report = ClockReport.model_validate({"stream": "x", "skew_ppm": 1.0, "num_samples": 3})
     assert (report.method, report.latency_sigma_ms) == (None, None)
     assert (report.num_steps, report.warnings) == (0, ())
+
+
+@pytest.mark.parametrize(("stamps", "numbers"), [(True, True), (True, False), (False, True)])
+@pytest.mark.parametrize("count", [2, 9])
+def test_a_stream_of_few_samples_is_dated_by_their_arrival(stamps, numbers, count):
+    """Such as a thermometer with a sample every few seconds: too few for a line."""
+    whole, descriptor = take(stamps=stamps, numbers=numbers)
+    batch = SampleBatch(*(column[:count] for column in vars(whole).values()))
+    timed = time_stream(batch, descriptor, latency_ns=1000)
+    assert timed.report.method == "arrival"
+    np.testing.assert_array_equal(timed.t_host_ns, batch.t_host_ns - 1000)
+
+
+@pytest.mark.parametrize("stamps", [True, False])
+@pytest.mark.parametrize("bits", [16, 32])
+def test_a_device_that_starts_anew_has_lost_what_it_did_not_send_alone(stamps, bits):
+    """Its counter begins at 0 again after more than half of its way: the nearer way is ahead."""
+    index = np.arange(COUNT, dtype=np.int64)
+    is_new = index >= 150
+    _, descriptor = take(stamps=stamps, numbers=True)
+    capabilities = descriptor.capabilities.model_copy(update={"sequence_bits": bits})
+    true_ns = 10**12 + index * PERIOD_NS + is_new * 2_000_000_000
+    batch = SampleBatch(
+        t_host_ns=true_ns + index * 7919 % 97 * 5000,
+        t_device_ns=np.where(is_new, index - 150, index + 1000) * PERIOD_NS
+        if stamps
+        else -(index**0),
+        sequence=np.where(is_new, index - 150, index + round(0.55 * 2**bits)),
+        values=np.zeros((COUNT, 1), dtype=np.float32),
+    )
+    timed = time_stream(batch, descriptor.model_copy(update={"capabilities": capabilities}))
+    assert (timed.report.num_steps, timed.report.num_dropped) == (1, 0)
+    np.testing.assert_allclose(timed.t_host_ns - true_ns, 0, atol=100_000)
+
+
+def test_a_counter_beyond_its_bits_is_refused_with_the_name_of_its_stream():
+    batch, descriptor = take(stamps=True, numbers=True)
+    narrow = ClockCapabilities(device_time=True, sequence=True, device_time_bits=24)
+    descriptor = descriptor.model_copy(update={"capabilities": narrow})
+    with pytest.raises(InvalidInputError, match=r"stream 'x': counter: got counts 0 … 2990000000"):
+        time_stream(batch, descriptor)

@@ -23,9 +23,17 @@ def store(tmp_path_factory):
             columns = recorded[name][1]
             columns[:] = [np.delete(column, lost, axis=0) for column in columns]
 
+    def miss(recorded, _):
+        # 0.13 s in which a taxel of one glove is not read.
+        raw, columns = recorded["tactile_left"]
+        columns[3] = columns[3].astype(np.float32)
+        columns[3][100:108, 40] = np.nan
+        recorded["tactile_left"] = raw.model_copy(update={"dtype": "float32"}), columns
+
     gloves = ("tactile_left", "tactile_right")
     write_recording(store, streams, "human", recording_id="whole")
     write_recording(store, streams, "human", recording_id="gaps", edit=lose)
+    write_recording(store, streams, "human", recording_id="missing", edit=miss)
     write_recording(store, streams, "human", recording_id="bare", leave_out=gloves)
     return store
 
@@ -47,6 +55,14 @@ def test_gaps_of_gloves_cost_no_step(store):
     assert episode.attributes.quality["retargeting_left_wrist_offset_mm"] > 1
     # A short gap is interpolated.
     assert np.abs(gaps[:80, :3, 3] - whole[:80, :3, 3]).max() < 0.002
+
+
+@pytest.mark.long
+def test_samples_that_miss_a_taxel_are_a_gap(store):
+    whole, _, _ = wrists(store, "whole", TOUCH)
+    missing, _, episode = wrists(store, "missing", TOUCH)
+    assert episode.attributes.quality["tactile_left_num_incomplete"] == 8
+    assert np.abs(missing[:, :3, 3] - whole[:, :3, 3]).max() < 0.002
 
 
 def test_without_gloves_the_wrist_has_one_offset_and_the_fingers_are_as_retargeted(store):

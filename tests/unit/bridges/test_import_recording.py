@@ -1,6 +1,7 @@
 """Recordings from streams of foreign files: names, order, provenance and the report."""
 
 import hashlib
+import re
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from dextouch.bridges.import_recording import (
     Refused,
     find_format,
     new_attributes,
+    recording_id_of,
     stream_names,
     write_recording,
 )
@@ -149,3 +151,9 @@ def test_names_follow_the_rule() -> None:
         stream_names(["/a"], {"X": "/a"})
     with pytest.raises(InvalidInputError, match="expected one"):
         stream_names(["/a"], {"x": "/a", "y": "/a"})
+
+
+def test_names_without_a_latin_letter_have_ids_of_their_own() -> None:
+    ids = {recording_id_of(Path(name), "lab-") for name in ("拿瓶.mcap", "放瓶.mcap", "_.mcap")}
+    assert len(ids) == 3
+    assert all(re.fullmatch("lab-imported-[0-9a-f]{8}", one) for one in ids)

@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -249,6 +250,18 @@ def test_disks_that_cannot_exchange_or_link_do_as_well(store, folder, monkeypatc
     assert [p.name for p in folder.parent.iterdir()] == ["dataset"]
 
 
+def test_a_link_to_a_dataset_stays_one(store, folder, tmp_path, monkeypatch):
+    link = tmp_path / "link"
+    link.symlink_to(folder)
+    export_dataset([episode(store, 3)], link, repo_id="lab/touch")
+    export_dataset([episode(store, 4)], link, repo_id="lab/touch", options=APPEND)
+    monkeypatch.chdir(folder)
+    export_dataset([episode(store, 5)], Path(), repo_id="lab/touch", options=APPEND)
+    assert link.is_symlink()
+    assert len(rows(folder, "meta/episodes")) == 3
+    assert [p.name for p in folder.parent.iterdir()] == ["dataset"]
+
+
 def test_a_replacement_that_fails_leaves_the_old_dataset(store, folder, monkeypatch):
     export_dataset([episode(store, 3)], folder, repo_id="lab/touch")
     before = hashes(folder)
@@ -262,7 +275,7 @@ def test_a_replacement_that_fails_leaves_the_old_dataset(store, folder, monkeypa
         export_dataset([episode(store, 4)], folder, repo_id="lab/touch", options=options)
     assert hashes(folder) == before
     (folder / INFO).unlink()
-    with pytest.raises(ConflictError, match="is not a LeRobot data set"):
+    with pytest.raises(ConflictError, match="is no LeRobot data set"):
         export_dataset([episode(store, 5)], folder, repo_id="lab/touch", options=options)
 
 

@@ -279,8 +279,32 @@ def test_rates_that_are_no_whole_numbers_are_refused(store, folder):
 def test_an_existing_folder_and_a_strange_name_are_refused(store, folder):
     readers = two(store)
     folder.mkdir(parents=True)
-    with pytest.raises(ConflictError, match="exists"):
+    # No advice that would be refused, too.
+    with pytest.raises(ConflictError, match="is no LeRobot data set; choose another folder"):
         export_dataset(readers, folder, repo_id="touch")
     for name in ("", "a/b/c", "../x", "a b"):
         with pytest.raises(InvalidInputError, match="repo_id"):
             export_dataset(readers, folder.with_name("new"), repo_id=name)
+
+
+def _without_colours(dtype, unit):
+    made = make_episode()
+    made.values["camera_wrist_left"] = made.values["camera_wrist_left"][..., 0].astype(dtype)
+    changes = {"shape": (48, 64), "dtype": dtype, "unit": unit}
+    made.descriptors = [
+        d.model_copy(update=changes) if d.name == "camera_wrist_left" else d
+        for d in made.descriptors
+    ]
+    return made
+
+
+@pytest.mark.parametrize(("dtype", "unit"), [("uint8", "mono8"), ("uint16", "mm")])
+def test_cameras_without_colours_are_left_out_unless_chosen(store, folder, dtype, unit):
+    reader = _without_colours(dtype, unit).write(store)
+    made = export_dataset([reader], folder, repo_id="touch")
+    assert made.cameras_left_out == ("camera_wrist_left",)
+    assert problems(folder) == []
+    assert not (folder / "videos/observation.images.camera_wrist_left").exists()
+    chosen = ExportOptions(cameras=("camera_wrist_left",), existing="replace")
+    with pytest.raises(ShapeError, match=rf"'camera_wrist_left': got {dtype} \[48, 64\]"):
+        export_dataset([reader], folder, repo_id="touch", options=chosen)

@@ -105,6 +105,20 @@ def test_our_own_dataset_gives_back_the_episodes(store, other, folder, unit):
 
 
 @pytest.mark.long
+def test_cameras_of_any_name_come_back_also_without_that_of_the_head(store, other, folder):
+    made = make_episode(num_steps=3)
+    made.drop("camera_head")
+    for columns in (made.values, made.stamps_ns):
+        columns["overview"] = columns.pop("camera_wrist_left")
+    made.descriptors = [
+        d.model_copy(update={"name": "overview"}) if d.kind == "image" else d
+        for d in made.descriptors
+    ]
+    export_dataset([made.write(store)], folder, repo_id="touch")
+    (name,) = import_dataset(folder, other).ids
+    assert other.open(name).num_samples("overview") == 3
+
+
 def test_attributes_come_back_with_the_episode_in_the_lineage(store, other, folder):
     reader = two(store)[0]
     export_dataset([reader], folder, repo_id="touch")

@@ -8,6 +8,7 @@ import pytest
 pytest.importorskip("pyarrow", reason="pyarrow is not installed: pip install '.[export]'")
 
 from dextouch.bridges.lerobot import export_dataset, import_dataset
+from dextouch.bridges.umi import export_umi
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import InvalidInputError
 from tests.unit.world_model.conftest import make_episode, write_episode
@@ -28,10 +29,12 @@ def test_a_data_set_keeps_the_layout(tmp_path):
     )
 
 
-def test_a_data_set_of_two_gloves_is_refused(tmp_path):
+def test_a_data_set_or_file_of_two_gloves_is_refused(tmp_path):
     store = EpisodeStore(tmp_path / "store")
     write_episode(store, small_episode(0), success=True)
     write_episode(store, make_episode(1), success=True)
     readers = [store.open("toy-0"), store.open("toy-1")]
+    with pytest.raises(InvalidInputError, match=r"got tactile layouts 'small'.*'dextouch_v1'"):
+        export_umi(readers, tmp_path / "file.zip")
     with pytest.raises(InvalidInputError, match=r"got tactile layouts 'small'.*'dextouch_v1'"):
         export_dataset(readers, tmp_path / "set", repo_id="a/b")

@@ -1,16 +1,20 @@
 """Rerun: every sample of a file is what the store holds, as Rerun's own reader gives it back."""
 
+import resource
+import warnings
+
 import numpy as np
 import pytest
 
 rr = pytest.importorskip("rerun", reason="rerun-sdk is not installed: pip install '.[rerun]'")
 
+from dextouch.bridges import import_rerun  # noqa: E402
 from dextouch.bridges.export_files import heat_map  # noqa: E402
 from dextouch.bridges.import_recording import ImportAttributes  # noqa: E402
 from dextouch.bridges.import_rerun import import_rrd  # noqa: E402
 from dextouch.bridges.rerun import entity_of, export_rrd  # noqa: E402
 from dextouch.episodes import EpisodeStore  # noqa: E402
-from dextouch.errors import ConflictError, InvalidInputError  # noqa: E402
+from dextouch.errors import ConflictError, InvalidInputError, StorageError  # noqa: E402
 from dextouch.geometry import transform_from_pose  # noqa: E402
 from tests.unit.bridges.takes import (  # noqa: E402
     DISTORTION,
@@ -151,6 +155,40 @@ def test_existing_files_are_kept_unless_told_otherwise(store, tmp_path):
     export_rrd(reader, path, overwrite=True)
     assert [e.recording_id for e in rr.chunk.RrdReader(path).recordings()] == ["stand-bottle-0003"]
     assert len(rr.chunk.RrdReader(path).blueprints()) == 1
+
+
+def test_warnings_of_others_do_not_discard_an_export(store, tmp_path, monkeypatch):
+    def opened(path):
+        warnings.warn("this form of arrays is to go", DeprecationWarning, stacklevel=1)
+        return rr.chunk.RrdReader(path)
+
+    monkeypatch.setattr(import_rerun, "RrdReader", opened)
+    export_rrd(write_episode(store, num_steps=3), tmp_path / "take.rrd")
+    assert (tmp_path / "take.rrd").is_file()
+
+
+def test_errors_of_rerun_do_not_ask_for_space(store, tmp_path, monkeypatch):
+    def fail(*_args, **_more):
+        raise RuntimeError("no such codec")
+
+    monkeypatch.setattr(rr.RecordingStream, "flush", fail)
+    with pytest.raises(StorageError, match=r"take.rrd: no such codec$"):
+        export_rrd(write_episode(store, num_steps=3), tmp_path / "take.rrd")
+
+
+@pytest.mark.parametrize("missing", [100, 6_000, 200_000])
+def test_a_full_disk_leaves_no_file(missing, store, tmp_path):
+    reader = write_episode(store, num_steps=9)
+    export_rrd(reader, tmp_path / "whole.rrd")
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    least = (tmp_path / "whole.rrd").stat().st_size - missing
+    resource.setrlimit(resource.RLIMIT_FSIZE, (least, limits[1]))
+    try:
+        with pytest.raises(StorageError, match=r"take.rrd: .*(free space and try|shut down)"):
+            export_rrd(reader, tmp_path / "take.rrd")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["store", "whole.rrd"]
 
 
 @pytest.mark.parametrize(("dtype", "unit"), [("uint8", "mono8"), ("uint16", "mm")])

@@ -11,6 +11,7 @@ from dextouch.episodes import EpisodeReader, EpisodeStore
 from dextouch.errors import ConflictError, InvalidInputError
 from dextouch.geometry.rotations import rotation_from_vector
 from dextouch.hands.actions import poses_from_actions
+from tests.unit.bridges.lerobot_episodes import make_episode
 from tests.unit.bridges.takes import CAMERAS, write_episode
 
 
@@ -85,6 +86,13 @@ def test_commands_beside_the_grid_of_actions_are_refused(two, tmp_path, monkeypa
     monkeypatch.setattr(EpisodeReader, "read", beside)
     with pytest.raises(InvalidInputError, match="not on the grid"):
         export_umi(two, tmp_path / "take.zarr.zip")
+
+
+def test_episodes_of_other_rates_are_refused(store, tmp_path):
+    made = [make_episode(seed=seed, num_steps=3) for seed in (1, 2)]
+    readers = [made[0].write(store), made[1].write(store, model_rate_hz=30.0)]
+    with pytest.raises(InvalidInputError, match=r"-0002: got .*30.0.* expected .*15.0"):
+        export_umi(readers, tmp_path / "take.zip")
 
 
 def test_episodes_that_do_not_fit_together_are_refused(store, tmp_path):

@@ -15,12 +15,14 @@ from benchmarks.simulated.board_scenes import mount_difference
 from dextouch.clients import HttpLink
 from dextouch.errors import (
     InvalidInputError,
+    NotFoundError,
     StaleDataError,
     UnknownNameError,
 )
 from dextouch.geometry import invert, transform
 from dextouch.geometry.rotations import rotation_from_vector
-from services.alignment.station_calibration import boards
+from dextouch.streams import pack
+from services.alignment.station_calibration import boards, mount
 from services.alignment.station_calibration import camera_views as camera
 from services.pipelines.calibrate import main
 from tests.unit.cli.rendered_boards import (
@@ -185,13 +187,60 @@ def test_blurred_photos_are_named_and_do_not_count(tmp_path, capsys):
     assert (told["blurred"], told["num_with_board"], told["num_photos"]) == (["moved.png"], 1, 2)
 
 
+def health_of(*names):
+    known = {"device": "d", "level": "OK", "reasons": [], "rate_hz": None, "nominal_rate_hz": 30.0}
+    known |= {"age_s": None, "received": 0, "lost": 0}
+    streams = [known | {"stream": name} for name in names]
+    return json.dumps(
+        {"station": "desk", "level": "OK", "streams": streams, "devices": []}
+    ).encode()
+
+
 def test_station_images_come_once_each_and_pauses_are_no_images():
     bodies = [b"a", b"a", StaleDataError("the newest image is 1 s old"), b"b"]
     replies = [one if isinstance(one, Exception) else SimpleNamespace(body=one) for one in bodies]
+    replies.insert(0, SimpleNamespace(body=health_of("camera_head")))
     link = create_autospec(HttpLink, instance=True)
     link.request.side_effect = replies
     arrivals = camera.station_arrivals(link, "head", wait=lambda _: None)
     assert [next(arrivals)[1], next(arrivals)[1]] == [b"a", b"b"]
+
+
+@pytest.mark.parametrize("of_mount", [False, True])
+def test_a_run_waits_half_a_minute_for_the_first_image_of_a_camera(of_mount):
+    no_pose = SimpleNamespace(body=pack({}, {}))
+    waited_s, num_late = [], 20
+
+    def request(method, path, **options):
+        if path == "/v1/health":
+            return SimpleNamespace(body=health_of("camera_head"))
+        if path.startswith("/v1/live/poses"):
+            return no_pose
+        if len(waited_s) < num_late:
+            raise NotFoundError("camera 'camera_head': not there, or no image yet")
+        return SimpleNamespace(body=b"a")
+
+    link = create_autospec(HttpLink, instance=True)
+    link.request.side_effect = request
+    newest = mount.station_sightings if of_mount else camera.station_arrivals
+    first = next(newest(link, "head", wait=waited_s.append))
+    assert (first.image if of_mount else first[1]) == b"a"
+    assert len(waited_s) == num_late
+    num_late = 10_000
+    waited_s.clear()
+    with pytest.raises(NotFoundError, match="no image yet"):
+        next(newest(link, "head", wait=waited_s.append))
+    assert sum(waited_s) == pytest.approx(30.0)
+
+
+@pytest.mark.parametrize("of_mount", [False, True])
+def test_a_camera_that_a_station_does_not_have_is_said_at_once(of_mount):
+    waited_s, link = [], create_autospec(HttpLink, instance=True)
+    link.request.return_value = SimpleNamespace(body=health_of("camera_head", "wrist_left"))
+    newest = mount.station_sightings if of_mount else camera.station_arrivals
+    with pytest.raises(NotFoundError, match="no such camera; it has: head"):
+        next(newest(link, "haed", wait=waited_s.append))
+    assert (waited_s, link.request.call_count) == ([], 1)
 
 
 @pytest.mark.parametrize(

@@ -70,6 +70,24 @@ def test_recorded_episodes_have_the_baseline_of_another_take(store, tmp_path, ca
     assert result["windows"]["all"]["other_take"]["psnr"] is not None
 
 
+def test_takes_shorter_than_a_chunk_are_left_out(tmp_path, capsys):
+    stage = Stage("stand_bottle", "robot", TwinSettings(image_height_px=64, image_width_px=64))
+    take = record(stage, 60_000, TakeOptions(images=("camera_head",)))
+    attributes = take.attributes.model_copy(update={"episode_id": "short", "seed": 60_001})
+    streams = {
+        name: replace(stream, t_ref_ns=stream.t_ref_ns[kept], values=stream.values[kept])
+        for name, stream in take.streams.items()
+        for kept in [stream.t_ref_ns <= round(9e9 / 15)]
+    }
+    mixed = EpisodeStore(tmp_path / "mixed")
+    for one in (take, replace(take, attributes=attributes, streams=streams)):
+        write_episode(mixed, one)
+    assert mixed.open("short").num_steps == 10
+    words = ["--horizon", "rollouts", "--metrics", "psnr", "--baselines", "copy"]
+    assert run(mixed, *words) == 0
+    assert "rollouts: 1 from 1 episodes" in capsys.readouterr().out
+
+
 def test_unknown_metrics_name_the_valid_ones(store, capsys):
     assert run(store, "--metrics", "psnr,lpisp") == 3
     assert "unknown metric 'lpisp'; valid: aesthetic_quality" in capsys.readouterr().err

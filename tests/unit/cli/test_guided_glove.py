@@ -144,8 +144,10 @@ def test_an_operator_is_led_to_a_calibration(bench, tmp_path, monkeypatch, capsy
         ("", 0.0),
         ("10", None),
         ("", 10.0),
-        # A slip: 3 kPa, with which nothing fits.
+        # A slip of a digit, 3 kPa: told at once. One of 15 kPa: nothing fits.
         ("2kg/65.38cm2", None),
+        ("", 30.0),
+        ("2kg/13.08cm2", None),
         ("", 30.0),
         ("drop", None),
         ("2kg/6.538cm2", None),
@@ -160,6 +162,8 @@ def test_an_operator_is_led_to_a_calibration(bench, tmp_path, monkeypatch, capsy
     assert "got 'ten', expected 30, or" in said
     assert "toe" in said
     assert "Not used: gain: no pressed taxel moved" in said
+    assert "Not used: gain: the presses make" in said
+    assert "times too low" in said
     assert "2 presses, not enough yet: gain: the response of all taxels" in said
     assert "pressures probably do not belong" in said
     assert "1 presses are left" in said

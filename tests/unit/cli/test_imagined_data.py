@@ -10,11 +10,13 @@ from dextouch.clients import RolloutClient
 from dextouch.command_line import positive
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import NotFoundError
+from dextouch.schemas import LineageEntry
 from dextouch.worlds import WorldServiceSettings, create_world_app
 from services.evaluation.endings import read_ending_episode
 from services.generation import imagine_episode
 from services.pipelines.imagined_data import (
     WORLD,
+    _picture,
     chosen_episodes,
     imagined_main,
     judged_steps,
@@ -28,6 +30,7 @@ from services.world_model.checkpoints import write_state_checkpoint
 from services.world_model.state_world import StateWorld
 from services.world_model.world import open_world
 from tests.contracts.test_world import untrained_state_checkpoint
+from tests.unit.evaluation import toy, toy_store
 
 
 @pytest.fixture(scope="module")
@@ -78,6 +81,16 @@ def test_a_judge_sees_what_it_would_have_seen_of_all_images(truth, checkpoint, t
         assert np.abs(difference).mean() < 2.0
         np.testing.assert_allclose(ending.tactile_kpa, wanted.tactile_kpa, atol=1e-3)
         np.testing.assert_allclose(ending.object_poses, wanted.object_poses, atol=1e-5)
+
+
+def test_an_episode_made_of_another_is_the_source_of_what_is_imagined(tmp_path):
+    """As an episode that was exported and imported again."""
+    store, item = EpisodeStore(tmp_path), toy.demonstration("reach", 3)
+    lineage = [LineageEntry(kind="episode", id="exported")]
+    toy_store.write(store, item, episode_id="imported", lineage=lineage)
+    lineage.append(LineageEntry(kind="episode", id="imported"))
+    toy_store.write(store, item, episode_id="imagined", lineage=lineage, origin="imagined")
+    assert _picture(store, store.open("imagined"), 2).title == "reach: imported"
 
 
 def test_seeds_are_written_as_a_range():

@@ -1,17 +1,38 @@
 """Patience of the HTTP client with a service that is full, restarting, or behind a proxy."""
 
 import threading
+from contextlib import closing
 from http.server import BaseHTTPRequestHandler, HTTPServer
 
+import httpx
 import pytest
 
-from dextouch.clients import HttpLink
-from dextouch.errors import ConflictError, UnavailableError
+from dextouch.clients import EpisodeStoreClient, HttpLink, RolloutClient
+from dextouch.errors import ConflictError, InvalidInputError, UnavailableError
 
 PROBLEM = (
     b'{"type": "urn:dextouch:error:UnavailableError", "title": "t", "status": 503, "detail": "d"}'
 )
 OURS = {"Content-Type": "application/problem+json"}
+
+
+@pytest.mark.parametrize("client", [HttpLink, RolloutClient, EpisodeStoreClient])
+@pytest.mark.parametrize(
+    "url",
+    [
+        "http://h:abc",
+        "http://h:99999",
+        "http://[::1",
+        "h:80",
+        "ftp://h",
+        "http://",
+        "",
+        "http://h:0",
+    ],
+)
+def test_an_address_that_cannot_be_one_is_refused(client, url):
+    with pytest.raises(InvalidInputError, match=r"expected http\(s\)://HOST:PORT"):
+        client(url)
 
 
 @pytest.fixture
@@ -50,6 +71,20 @@ def link_to(url, patience_s=30.0):
     link = HttpLink(url, patience_s=patience_s, pause=pauses.append)
     assert link.request("POST", "/", body=b"first").body == b"yes"
     return link, pauses
+
+
+def test_a_key_may_end_with_the_end_of_its_file(scripted):
+    url, _, _ = scripted
+    key, sent = "a-key-of-some-length", []
+
+    def reply(request):
+        sent.append(request.headers["authorization"])
+        return httpx.Response(200, json={"uploads": []})
+
+    with closing(HttpLink(url, api_key=f"{key}\r\n")) as link:
+        assert link.request("POST", "/", body=b"").body == b"yes"
+    EpisodeStoreClient(url, f"{key}\n", transport=httpx.MockTransport(reply)).uploads()
+    assert sent == [f"Bearer {key}"]
 
 
 def test_it_waits_as_long_as_asked_and_sends_the_same_again(scripted):

@@ -9,7 +9,7 @@ import pytest
 from dashboard_fakes import broken_upstream
 from fastapi import FastAPI, Response
 
-from dextouch.errors import NotFoundError
+from dextouch.errors import InvalidInputError, NotFoundError
 from dextouch.schemas import StationOverview
 from dextouch.streams import pack
 from services.dashboard.app import create_app
@@ -140,6 +140,11 @@ def test_stations_are_chosen_by_name():
     assert fleet.of("two") is not fleet.of("one")
     with pytest.raises(NotFoundError, match="it shows one, two"):
         fleet.of("three")
+
+
+def test_addresses_of_services_are_checked_at_the_start():
+    with pytest.raises(InvalidInputError, match=r"twin: got 'h:80', expected http"):
+        create_app(DashboardSettings(twin_url="h:80"))
 
 
 async def test_pages_of_a_station_that_is_none_are_refused():

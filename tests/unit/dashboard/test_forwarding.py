@@ -83,6 +83,38 @@ async def test_names_in_paths_stay_one_part(client, services):
     assert services.asked[-1] == "/v1/episodes/a%3Fb%23c"
 
 
+@pytest.mark.parametrize(
+    "path",
+    [
+        # Would issue a key of a station, which needs another scope than a note.
+        "episode_store/notes/%2e%2e/enrolments",
+        "episode_store/notes/episode/%2e",
+        "uploads/%2e%2e/retry",
+    ],
+)
+async def test_names_in_paths_lead_nowhere_else(client, services, path):
+    answer = await client.post(f"/v1/{path}", json={})
+    assert answer.status_code == 404
+    assert "expected the name of an item" in answer.json()["detail"]
+    assert services.asked == []
+
+
+@pytest.mark.parametrize(
+    ("path", "headers"),
+    [
+        ("episodes", {"if-none-match": b"\xe9"}),
+        # Each bad byte becomes nine letters.
+        ("catalog/items?text=" + "%ff" * 10_000, {}),
+    ],
+)
+async def test_what_cannot_be_passed_on_is_refused(client, services, path, headers):
+    answer = await client.get(f"/v1/episode_store/{path}", headers=headers)
+    assert answer.status_code == 422
+    assert "episode_store: GET /v1/" in answer.json()["detail"]
+    assert len(answer.json()["detail"]) < 300
+    assert services.asked == []
+
+
 async def test_refusals_are_passed_on(client):
     answer = await client.get("/v1/episode_store/playback/episode/take-0001")
     assert answer.status_code == 503

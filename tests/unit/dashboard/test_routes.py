@@ -101,6 +101,15 @@ async def test_nothing_is_saved_without_an_outcome(client, services):
         assert services.asked[-1] == {"success": success}
 
 
+@pytest.mark.parametrize("outcome", ["NaN", "1e400", r'"\ud800"'])
+async def test_what_is_no_json_reaches_no_station(client, services, outcome):
+    sent = {"content": f'{{"success": {outcome}}}', "headers": {"content-type": "application/json"}}
+    answer = await client.post("/v1/recorder/save", **sent)
+    assert answer.status_code == 422
+    assert "acquisition: POST /v1/recorder/save" in answer.json()["detail"]
+    assert services.asked == []
+
+
 async def test_recorder_conflict_is_passed_on(client):
     answer = await client.post("/v1/recorder/record", json={})
     assert answer.status_code == 409
@@ -242,6 +251,7 @@ async def test_live_survives_nonsense(make_app):
         await socket.receive()
         for text in ("", "[]", '{"view": 3}', '{"view": [1, {}]}', "x" * 5000, '["takes"]'):
             socket._to_app.put_nowait({"type": "websocket.receive", "text": text})
+        socket._to_app.put_nowait({"type": "websocket.receive", "bytes": b'{"view": ["takes"]}'})
         socket.look_at("takes")
         assert json.loads((await socket.receive())["text"])["topic"] == "takes"
         await socket.leave()

@@ -240,6 +240,17 @@ async def test_images_are_those_of_the_span(http, store):
     assert Image.open(io.BytesIO(first)).size == (16, 16)
 
 
+@pytest.mark.parametrize("stop_ns", [2**62, 2**63 - 1, 10**30])
+async def test_signals_to_the_end_are_those_until_the_largest_time(http, store, stop_ns):
+    write_episode(store, "e-1")
+    url, query = "/v1/playback/episode/e-1/signals", {"names": "action", "points": 1, "start_ns": 0}
+    to_the_end, most = [
+        await http.get(url, params=query | {"stop_ns": stop}) for stop in (stop_ns, 2**62 - 1)
+    ]
+    assert to_the_end.status_code == 200, to_the_end.text
+    assert to_the_end.content == most.content
+
+
 @pytest.mark.parametrize(
     ("path", "status"),
     [
@@ -249,6 +260,7 @@ async def test_images_are_those_of_the_span(http, store):
         ("rollout/e-1", 422),
         ("episode/..%2Fe-1", 404),
         ("episode/e-1/signals?names=tactile_left&start_ns=5&stop_ns=5", 422),
+        (f"episode/e-1/signals?names=tactile_left&start_ns={2**63}&stop_ns={2**64}", 422),
         ("episode/e-1/signals?names=tactile_left.320&start_ns=0&stop_ns=5", 422),
         ("episode/e-1/signals?names=tactile_left.%C2%B2&start_ns=0&stop_ns=5", 422),
         ("episode/e-1/signals?names=camera_head&start_ns=0&stop_ns=5", 422),

@@ -1,7 +1,7 @@
 """Queries of the catalog find what plain Python finds, while items come, go and are reviewed."""
 
 from collections import Counter
-from datetime import timedelta
+from datetime import UTC, datetime, timedelta
 
 import numpy as np
 import pytest
@@ -19,6 +19,12 @@ NAMES = [
     f"{stem}{end}"
     for stem in ("a", "b", "c-d", "e_")
     for end in ("", "-1", "1", "_2", "0-x", "z", "-", "9")
+]
+# Midnight in UTC, India, Adelaide and Nepal, before 1970, too.
+MIDNIGHTS = [
+    datetime(year, 1, 1, *clock, tzinfo=UTC)
+    for year in (2, 1970, 2026, 9998)
+    for clock in ((0, 0), (18, 30), (14, 30), (18, 15))
 ]
 SORTS = ["id", "time", "duration", "task", "operator", "station", "findings"]
 
@@ -145,6 +151,43 @@ def compare_episodes(catalog, episodes, linked, rng, checked):
         seconds = sum(row[2].summary.duration_s for row in expected)
         assert 3600 * hours.hours == pytest.approx(seconds)
         checked["rows"] += count
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_hours_of_days_are_those_of_a_recount(settings, seed):
+    """About midnight of several zones, while episodes and sources come, go and are reviewed."""
+    store, rng = EpisodeStore(settings.store_url), np.random.default_rng(seed)
+    catalog, sources = Catalog(store), ["r-0", "r-1"]
+    for name in sources:
+        put_item(store, "recording", name)
+    for _ in range(8):
+        for name in rng.choice(NAMES, 8, replace=False):
+            at = MIDNIGHTS[rng.integers(16)] - timedelta(microseconds=int(rng.integers(2)))
+            changes = {
+                "created_at": at if rng.random() < 0.9 else None,
+                "task": rng.choice(["a", "b"]),
+            }
+            changes["lineage"] = [{"kind": "recording", "id": str(rng.choice(sources))}]
+            put_item(store, "episode", name, num_rows=int(rng.integers(1, 999)), **changes)
+        review_random(store, rng, "recording", sources[rng.integers(2)])
+        for name in rng.choice(store.list(), 2, replace=False):
+            review_random(store, rng, "episode", name)
+        store.delete(store.list()[0])
+        catalog.index.check()
+        linked = plain.listed(*(plain.read_all(store, kind) for kind in ("recording", "episode")))
+        filters = [{}, {"task": "a"}, {"text": "b"}, {"created_after": NOON}, {"domain": "robot"}]
+        for chosen in filters:
+            for offset_min in (0, 330, 570, -570, 345, int(rng.integers(-840, 841))):
+                query = HoursFilter(**chosen, utc_offset_min=offset_min)
+                items = [e for e in linked["episode"].values() if plain.matches(e, query)]
+                sums = plain.hours_by(items, "day", offset_min)
+                rows = catalog.hours_by("day", query).rows
+                assert {row.value for row in rows} == sums.keys()
+                assert sum(row.num_episodes for row in rows) == len(items)
+                for row in rows:
+                    for verdict in ("accepted", "rejected", "not_reviewed"):
+                        found_s = 3600 * getattr(row, f"{verdict}_h")
+                        assert found_s == pytest.approx(sums[row.value].get(verdict, 0.0))
 
 
 def expected_groups(lists):

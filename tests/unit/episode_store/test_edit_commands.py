@@ -58,7 +58,7 @@ def test_trim_by_seconds_or_steps(run, store):
         (["relabel", "a"], "nothing changes"),
         (
             ["relabel", "a", "--task", "x" * 129, "--outcome", "keep"],
-            "task: String should have at most 128",
+            "task: Value should have at most 128",
         ),
         (["relabel", "a", "--instruction", "up\x1b[2J"], "U+001B"),
         (["relabel", "a", "a", "--task", "x", "--as", "b"], "--as names one item"),

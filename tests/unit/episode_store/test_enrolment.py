@@ -312,6 +312,12 @@ async def test_long_and_odd_tokens_are_refused_without_repeating_them(http):
         assert "xxxx" not in refused.text
 
 
+async def test_a_token_that_no_encoding_can_hold_is_an_unknown_one(http):
+    guess = {"content": r'{"token": "\ud800"}', "headers": {"content-type": "application/json"}}
+    refused = await http.post("/v1/enrolments/exchange", **guess)
+    assert refused.json()["details"]["reason"] == "unknown_token"
+
+
 def test_a_renewed_key_is_valid_beside_the_former_one_until_that_is_revoked(make):
     enrolments, access = make()
     with pytest.raises(ConflictError, match="renew"):

@@ -4,6 +4,7 @@ import time
 
 import pytest
 from fastapi.testclient import TestClient
+from pydantic import ValidationError
 
 from dextouch.episodes import EpisodeStore
 from dextouch.episodes.trash import put_into_trash
@@ -98,3 +99,8 @@ def test_the_trash_is_emptied_after_some_days(tmp_path, keep_days, left):
         put_into_trash(tmp_path, "episode", name, now_ns=deleted_ns)
     purge_old_trash(store, keep_days)
     assert [entry.item_id for entry in store.trash_list()] == left
+
+
+def test_days_without_end_are_left_out_instead(settings):
+    with pytest.raises(ValidationError, match="finite number"):
+        EpisodeStoreSettings(store_url=settings.store_url, keep_trash_days=float("inf"))

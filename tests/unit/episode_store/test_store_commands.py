@@ -258,6 +258,26 @@ def test_repair_from_a_copy_and_by_salvage(store, word, tmp_path):
     assert (status, "e-1  left" in out) == (1, True)
 
 
+@pytest.mark.parametrize("words", [["verify"], ["repair"], ["purge"], ["list", "--trash"]])
+def test_a_store_that_is_not_there_is_not_in_order(tmp_path, capsys, words):
+    assert main(["store", *words, "--store", str(tmp_path / "unmounted")]) == 3
+    assert "unmounted: no such folder" in capsys.readouterr().err
+
+
+def test_nothing_is_salvaged_where_the_copy_is_not_there(store, word, tmp_path):
+    flip(shard_of(store, "recordings", "r-1", "force"))
+    status, _, err = word("repair", "--from", str(tmp_path / "unmounted"))
+    assert (status, "unmounted: no such folder" in err) == (3, True)
+    assert store.list(kind="recording") == ["r-1"]
+
+
+def test_an_item_without_its_commit_record_can_be_deleted(store, word):
+    (store.root / "episodes/e-1/commit.json").unlink()
+    assert word("delete", "e-1", "e-1") == (0, "e-1  in the trash\n", "")
+    assert word("verify")[0] == 0
+    assert not (store.root / "episodes/e-1").exists()
+
+
 def derived_of(store, recording_id, episode_id):
     lineage = LineageEntry(kind="recording", id=recording_id)
     write_episode(store, episode_id, lineage=[lineage.model_dump()])

@@ -246,6 +246,18 @@ def test_a_backup_that_lost_something_says_so(stores, capsys):
     assert main(words) == 0
 
 
+def test_copies_without_their_commit_record_are_replaced(stores):
+    source, backup, target = stores
+    write_episode(source, "a")
+    back_up(source, backup)
+    (backup.root / "episodes/a/commit.json").unlink()
+    assert actions(back_up(source, backup)) == {("episode", "a"): "copied"}
+    shutil.copytree(source.root, target.root)
+    (target.root / "episodes/a/commit.json").unlink()
+    assert actions(restore_backup(backup, target)) == {("episode", "a"): "copied"}
+    assert not differences(source, target)
+
+
 def test_interrupted_backups_and_restorations_are_completed(stores):
     source, backup, target = stores
     for name in ("a", "b"):

@@ -14,7 +14,7 @@ from obstore.store import S3Store
 from structlog.testing import capture_logs
 from zarr.storage import ObjectStore
 
-from dextouch.episodes import EpisodeStore
+from dextouch.episodes import EpisodeStore, bucket_storage
 from dextouch.episodes.bucket_storage import BLOCK_BYTES, ORPHAN_AGE, sweep_orphans
 from dextouch.episodes.s3_bucket import Bucket
 from dextouch.errors import (
@@ -120,7 +120,7 @@ def unused_port():
 
 DYING_WRITER = """
 import os, signal, sys
-from dextouch.episodes import EpisodeStore
+from dextouch.episodes import EpisodeStore, bucket_storage
 from dextouch.episodes.s3_bucket import Bucket
 from tests.contracts.s3_server import CREDENTIALS
 from tests.unit.episodes.conftest import episode_of
@@ -333,6 +333,68 @@ def test_an_upload_under_a_foreign_claim_waits_and_overwrites_nothing(store, buc
     assert list(bucket.list("episodes")) == []
     assert store.complete_uploads() == (("episode", EPISODE),)
     store.open(EPISODE).verify()
+
+
+def test_a_sweep_goes_on_where_deletions_are_refused(
+    s3_server, store, bucket, made, tmp_path, monkeypatch
+):
+    made.write(store)
+    store.set_review(EPISODE, None)
+    claim = b"0" * 64
+    for name in ("dead", "gone"):
+        bucket.put(f"episodes/{name}/zarr.json", b"x")
+        bucket.put(f"episodes/{name}/claim", claim)
+    # Everything is old enough.
+    monkeypatch.setattr(bucket_storage, "ORPHAN_AGE", -ORPHAN_AGE)
+    with s3_server.refusing_deletions(f"unit/{tmp_path.name}"):
+        with capture_logs() as logs:
+            assert store.sweep() == 0
+        with pytest.raises(StorageError, match=r"refused \(AccessDenied\); check the credentials"):
+            store.delete(EPISODE)
+    (warning,) = logs
+    assert (warning["event"], warning["log_level"]) == ("orphans_not_removed", "warning")
+    assert warning["places"] == ["episodes/dead", "episodes/gone", ".changes"]
+    assert "AccessDenied" in warning["reason"]
+    assert "s3:DeleteObject" in warning["advice"]
+    # What uploads it could go on later.
+    assert bucket.get("episodes/dead/claim") == claim
+    assert store.sweep() == 2
+    assert list(bucket.list("episodes/dead")) == []
+
+
+def orphans(bucket, *names):
+    for name in names:
+        bucket.put(f"episodes/{name}/zarr.json", b"x")
+    return {"now": datetime.now(UTC) + ORPHAN_AGE + timedelta(minutes=1)}
+
+
+def test_a_sweep_asks_once_whether_it_may_delete(bucket, s3_server, tmp_path, monkeypatch):
+    late, asked, remove = orphans(bucket, "a", "b", "c"), [], Bucket.remove
+
+    def noted(self, keys):
+        asked.extend(key for key in keys if key.endswith("/none"))
+        remove(self, keys)
+
+    monkeypatch.setattr(Bucket, "remove", noted)
+    with s3_server.refusing_deletions(f"unit/{tmp_path.name}"), capture_logs() as logs:
+        assert sweep_orphans(bucket, **late) == 0
+    assert len(asked) == 1
+    assert logs[0]["count"] == 3
+    assert sweep_orphans(bucket, **late) == 3
+    assert len(asked) == 2
+
+
+def test_a_sweep_that_may_not_write_asks_for_no_deletions(bucket, monkeypatch):
+    late = orphans(bucket, "a")
+
+    def refuse(*_args, **_more):
+        raise StorageError("write: refused (AccessDenied)")
+
+    monkeypatch.setattr(Bucket, "put", refuse)
+    with capture_logs() as logs:
+        assert sweep_orphans(bucket, **late) == 0
+    assert logs[0]["reason"] == "write: refused (AccessDenied)"
+    assert "s3:DeleteObject" not in logs[0]["advice"]
 
 
 @pytest.mark.long

@@ -1,5 +1,6 @@
 """Edited items against the arrays that their sources were written from."""
 
+import shlex
 from datetime import UTC, datetime
 
 import numpy as np
@@ -181,7 +182,11 @@ def encoded(images):
     return [encode_jpeg(image) for image in images]
 
 
-def test_interpolated_spans_figures_and_the_origin_move_with_the_cut(store):
+# Of steps 6 … 8 and 15 … 17, or where step 0 is 10 ms before 0, of 6 … 9 and 16 … 18.
+@pytest.mark.parametrize(("zero_ns", "num_interpolated"), [(0, 6.0), (-10_000_000, 7.0)])
+def test_interpolated_spans_figures_and_the_origin_move_with_the_cut(
+    store, zero_ns, num_interpolated
+):
     calibration = {
         "interpolated_wrist_left_s": ((0.2, 0.6), (1.0, 1.2)),
         "interpolated_fingers_right_s": ((0.1, 0.3, 1.0),),
@@ -197,26 +202,25 @@ def test_interpolated_spans_figures_and_the_origin_move_with_the_cut(store):
     changed = source.attributes.model_copy(
         update={"episode_id": "marked", "calibration": calibration, "streams": ()}
     )
-    source = rewritten(store, source, changed)
+    source = rewritten(store, source, changed, zero_ns)
     store.delete("take-aligned")
     result = trim_episode(store, "marked", (6, 30), options=KEPT)
     ours = store.open(result.id)
     got = interpolated_spans(ours.attributes.calibration)
-    want = [("wrist_left", 0, 200_000_000), ("wrist_left", 600_000_000, 800_000_000)]
+    want = [("wrist_left", zero_ns, 200_000_000), ("wrist_left", 600_000_000, 800_000_000)]
     assert got == want
     np.testing.assert_array_equal(
         EpisodeGrid(ours).measured_columns, EpisodeGrid(source).measured_columns[6:]
     )
     assert ours.attributes.quality == {
         "origin_after_start_ns": 9e8,
-        # Steps 6 … 8 and 15 … 17.
-        "num_steps_interpolated": 6.0,
+        "num_steps_interpolated": num_interpolated,
         "tactile_left_num_refused_taxels": 2.0,
     }
     assert any("wrist_left_jerk" in message for message in result.messages)
 
 
-def rewritten(store, reader, attributes):
+def rewritten(store, reader, attributes, zero_ns=0):
     with store.writer(attributes=attributes) as writer:
         for descriptor in reader.attributes.streams:
             writer.add_stream(descriptor)
@@ -224,7 +228,7 @@ def rewritten(store, reader, attributes):
             writer.append(
                 descriptor.name,
                 values=reader.values(descriptor.name, 0, count),
-                t_ref_ns=reader.stamps_ns(descriptor.name).copy(),
+                t_ref_ns=reader.stamps_ns(descriptor.name) + zero_ns,
             )
     return store.open(attributes.episode_id)
 
@@ -391,6 +395,29 @@ def test_a_relabel_to_another_operator_is_another_one(store, tmp_path):
         relabel_item(store, "take", {"operator": "p-4"}, kind="recording")
 
 
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"operator": ""}, "operator: .* at least 1"),
+        ({"operator": "p" * 129}, "operator: .* at most 128"),
+        ({"instruction": "x" * 9000}, "instruction: .* at most 2000"),
+    ],
+)
+def test_labels_have_the_limits_of_requests(store, changes, message):
+    write_recording(store, "take", operator="p-1")
+    with pytest.raises(InvalidInputError, match=message):
+        relabel_item(store, "take", changes, kind="recording")
+    assert store.list(kind="recording") == ["take"]
+
+
+def test_the_longest_labels_fit_into_the_lineage(store):
+    write_recording(store, "take")
+    changes = {"task": "'" * 128, "instruction": "'" * 2000}
+    result = relabel_item(store, "take", changes, kind="recording", outcome="unknown")
+    (source,) = store.recording(result.id).attributes.lineage
+    assert shlex.split(source.operation)[2::2] == [*changes.values(), "unknown"]
+
+
 def test_an_edit_takes_only_the_files_of_arrays(store):
     write_episode(store, "a")
     (store.root / "episodes/a/backup.bin").write_bytes(b"x")
@@ -431,3 +458,11 @@ def test_a_trimmed_recording_has_its_samples_as_they_were(store):
     for span in [(4.0, None), (1.0, 1.0), (-1.0, 1.0)]:
         with pytest.raises(InvalidInputError, match="expected one within 0 … "):
             trim_recording(store, "take", *span)
+
+
+@pytest.mark.parametrize("changes", [{"keep": "yes"}, {"outcome": "failure"}])
+def test_only_texts_of_three_attributes_are_relabelled(store, changes):
+    write_episode(store, "a")
+    with pytest.raises(InvalidInputError, match="expected texts of task, instruction or operator"):
+        relabel_item(store, "a", changes)
+    assert store.list() == ["a"]

@@ -61,6 +61,25 @@ def damage_chunk(folder, name, number):
     return number
 
 
+def test_milestones_are_counted_from_the_first_step_that_is_left(store, make_episode):
+    events = {"grasp": 0.2, "stand": 1.5}
+    made = make_episode(num_steps=31)
+    made.write(store, event_times_s=events)
+    damage_chunk(store.root / "episodes" / ID, "action", 0)
+    lost_s = repair_group(store.root, "episode", ID).lost["action"] / 15
+    about = store.open(NEW).attributes
+    assert about.event_times_s == pytest.approx({"stand": 1.5 - lost_s})
+
+
+def test_milestones_after_the_last_step_that_is_left_are_left_out(store, make_episode):
+    made = make_episode(num_steps=31)
+    made.write(store, event_times_s={"grasp": 0.2, "stand": 2.0})
+    damage_chunk(store.root / "episodes" / ID, "action", 3)
+    repair_group(store.root, "episode", ID)
+    assert store.open(NEW).num_steps < 30
+    assert store.open(NEW).attributes.event_times_s == pytest.approx({"grasp": 0.2})
+
+
 def check_salvaged(store, truth, gone):
     """The salvaged episode holds exactly what is not gone, by stream and row."""
     reader = store.open(NEW)

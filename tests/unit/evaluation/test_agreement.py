@@ -1,6 +1,7 @@
 """Agreement figures against scipy, hand calculations, brute force and simulated studies."""
 
 import math
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -47,6 +48,20 @@ def test_figures_of_draws_are_those_of_scipy():
         for name, measure in FIGURES.items():
             single = measure.compute(real=real[row], imagined=imagined[row])
             assert found[name][row] == pytest.approx(single, abs=1e-9)
+
+
+def test_draws_of_many_policies_take_little_memory():
+    draws = ScoreDraws(*rng(2).random((2, 1500, 100)))
+    tracemalloc.start()
+    found = figures_of_draws(draws)
+    _, peak_bytes = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    # All pairs at once are 120 MB an array.
+    assert peak_bytes < 120e6
+    alone = figures_of_draws(ScoreDraws(draws.real[-1:], draws.imagined[-1:]))
+    assert {name: values[-1] for name, values in found.items()} == {
+        name: value for name, (value,) in alone.items()
+    }
 
 
 def test_three_policies_in_order_are_chance_once_in_six():

@@ -108,6 +108,16 @@ def test_training_needs_a_success():
         train_cloned_policy(episodes(range(12), success=False), CloningSettings(), command="x")
 
 
+def test_a_task_of_which_nothing_could_be_learned_is_refused():
+    some = [
+        toy.replace(one, measured=one.measured[:16]) if one.task == "reach far" else one
+        for one in episodes(range(12))
+    ]
+    settings = CloningSettings(num_training_steps=2, batch_size=4, held_out_share=0.3)
+    with pytest.raises(InvalidInputError, match="of reach far no demonstration that is longer"):
+        train_cloned_policy(some, settings, command="x")
+
+
 def test_decisions_are_whole_moments_of_one_episode():
     few = episodes(range(3))
     shape = CloningShape(tasks=toy.TASKS, image_size_px=toy.SIZE)

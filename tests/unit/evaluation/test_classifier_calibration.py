@@ -1,5 +1,7 @@
 """Calibration figures by hand, and temperatures that are known because we made the outcomes."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -15,6 +17,7 @@ from services.evaluation.classifier_calibration import (
 from services.evaluation.endings import Ending, EndingEpisode
 from services.evaluation.scores import LEAST_DECIDED
 from services.evaluation.success_classifier import Calibration, Combination, sigmoid
+from services.evaluation.success_classifier_training import ClassifierSets
 
 # Allowed share of wrong answers among what is decided.
 RISK = 0.10
@@ -58,12 +61,25 @@ def test_separable_endings_stay_finite():
     assert (told < 1).all()
 
 
-def test_a_judge_that_is_always_wrong_knows_nothing():
-    rng = np.random.default_rng(2)
-    odds = rng.normal(size=400)
-    told = fit_calibration(odds, odds < 0).probabilities(odds)
+@pytest.mark.parametrize("confidence", [-5.0, 0.0, 5.0])
+def test_a_judge_that_is_always_wrong_knows_nothing(confidence):
+    odds = np.random.default_rng(2).normal(size=400)
+    came, said = odds < 0, odds + confidence
+    told = fit_calibration(said, came).probabilities(said)
     assert np.ptp(told) < 0.01
-    assert told.mean() == pytest.approx((odds < 0).mean(), abs=0.02)
+    assert told == pytest.approx(np.full(400, came.mean()), abs=0.02)
+    both = sigmoid(np.stack([said, said]))
+    joint = fit_combination(*both, came).probabilities(*both)
+    assert joint == pytest.approx(np.full(400, came.mean()), abs=0.02)
+
+
+def test_estimates_that_are_always_even_leave_the_base_rate():
+    came = np.arange(40) % 4 == 0
+    assert fit_calibration(np.zeros(40), came).probabilities(np.zeros(1)) < 0.4
+    probe = np.where(came, 0.8, 0.3)
+    joint = fit_combination(probe, np.full(40, 0.5), came)
+    told = joint.probabilities(probe, np.full(40, 0.5))
+    assert ((told > 0.5) == came).all()
 
 
 def test_the_band_leaves_the_allowed_risk():
@@ -207,3 +223,6 @@ def test_true_endings_that_show_poses_alone_are_left_out():
     assert success.tolist() == [True]
     imagined, _ = final_endings(episodes, "t", "imagined")
     assert [one.object_poses is poses for one in imagined] == [True]
+    held_out = [episodes[1], replace(episodes[0], success=False)]
+    with pytest.raises(InvalidInputError, match="1 true takes of 't' that end with images"):
+        ClassifierSets(episodes, [], held_out).check_measurable()

@@ -64,6 +64,12 @@ def scene(seed, depth_m):
     )
 
 
+def test_steps_of_another_rate_are_refused():
+    world = PressWorld(tasks=("press",), image_height_px=PX, image_width_px=PX, model_rate_hz=30.0)
+    with pytest.raises(InvalidInputError, match="'e1' at 15 steps a second, expected 30"):
+        measure_prediction(world, [scene(1, 0.2)])
+
+
 def test_touch_that_was_not_measured_counts_in_no_figure():
     world = PressWorld(tasks=("press",), image_height_px=PX, image_width_px=PX)
     whole = scene(1, 0.2)

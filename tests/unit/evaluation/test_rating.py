@@ -40,6 +40,10 @@ def test_alpha_of_equal_ratings_is_undefined():
     assert np.isnan(krippendorff_alpha(np.ones((4, 3)), level="nominal"))
     assert np.isnan(krippendorff_alpha(np.array([[1, nan], [nan, 0]]), level="interval"))
     assert krippendorff_alpha(np.array([[1.0, 1.0], [0.0, 0.0]]), level="nominal") == 1.0
+    # The mean of such scores is not quite the score.
+    for same in (np.full((7, 3), 0.1), np.full((10, 2), 0.7)):
+        assert np.isnan(krippendorff_alpha(same, level="interval"))
+        assert np.isnan(intraclass_correlation(same))
 
 
 def test_alpha_with_absent_raters_by_hand():
@@ -65,6 +69,8 @@ def test_biases_of_raters_by_hand():
     strict, *_ = rater_biases(["a", "b", "c"], ratings, np.random.default_rng(0))
     assert (strict.rater, strict.bias, strict.num_rollouts) == ("a", pytest.approx(0.5), 2)
     assert strict.interval.low == pytest.approx(0.5)
+    # One rollout does not say how far the next one would be from it.
+    assert rater_biases(["a", "b"], ratings[:1, :2], np.random.default_rng(0)) == []
 
 
 def test_points_are_those_of_the_paper():

@@ -2,6 +2,7 @@
 
 import sqlite3
 from collections import Counter
+from itertools import pairwise
 
 import pytest
 from pydantic import ValidationError
@@ -114,6 +115,27 @@ def test_some_rollouts_come_back_after_a_while(log):
         assert order[names.index(name)] == (name, FIRST)
 
 
+def test_marks_of_other_rollouts_in_the_same_file_are_no_progress(log):
+    names = [[f"{study}-{number}" for number in range(40)] for study in ("first", "second")]
+    first, second = (
+        RatingQueue(rollouts(ids), log, raters_per_rollout=1, repeat_share=share)
+        for ids, share in zip(names, (0.0, 0.1), strict=True)
+    )
+    assert len(rate_all(first, log, "ada")) == 40
+    assert (second.next("ada").num_done, second.next("ada").num_open) == (0, 40)
+    repeats = [index for index, (_, shown) in enumerate(rate_all(second, log, "ada")) if shown == 2]
+    assert len(repeats) == 4
+    assert min(b - a for a, b in pairwise(repeats)) >= 10
+
+
+def test_one_rated_rollout_has_no_interval(log):
+    for rater in ("ada", "bob"):
+        log.add(mark(rater, IDS[0], standing=rater == "ada"))
+    tasks = dict.fromkeys(IDS, "stand_bottle")
+    found = rating_report(log.latest().values(), tasks, read_rubrics(), {})["tasks"]["stand_bottle"]
+    assert (found["score"], found["score_interval"], found["raters"]) == (0.5, "undefined", [])
+
+
 def test_automatic_marks_do_not_take_a_person_s_place(log):
     for name in IDS:
         log.add(mark("probe", name, kind="auto"))
@@ -211,7 +233,7 @@ def test_a_deciding_mark_is_not_repeated(log):
         log.add(mark("carl", name, presentation=DECIDING if number < 2 else FIRST))
     assert queue.next("carl") is None
     log.add(mark("carl", "of-another-store"))
-    assert queue.next("carl") == Assignment(queue.rollout(token_of(IDS[2])), REPEAT, 13, 0)
+    assert queue.next("carl") == Assignment(queue.rollout(token_of(IDS[2])), REPEAT, 12, 0)
 
 
 def test_a_tie_is_a_conflict_once_its_raters_are_complete(log):

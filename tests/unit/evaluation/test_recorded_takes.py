@@ -173,6 +173,9 @@ def test_tasks_and_images_must_fit_world_and_judge(store, client, probe):
     other = description.model_copy(update={"tasks": ("stir",)})
     with pytest.raises(InvalidInputError, match="'reach' is not one of the world"):
         score_recorded(takes, {}, address, other, probe)
+    fast = description.model_copy(update={"model_rate_hz": 30.0})
+    with pytest.raises(InvalidInputError, match="at 15 steps a second, expected 30"):
+        score_recorded(takes, {}, address, fast, probe)
     larger = description.model_copy(update={"image_height_px": 64})
     with pytest.raises(InvalidInputError, match="images of 64 px"):
         score_recorded(takes, {}, address, larger, probe)

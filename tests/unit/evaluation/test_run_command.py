@@ -9,10 +9,37 @@ import pytest
 from dextouch.errors import InvalidInputError
 from dextouch.worlds import WorldServiceSettings, create_world_app
 from services.evaluation.command_line import run_evaluation
+from services.evaluation.policies.user_policies import load_policies
 from services.evaluation.scores import REAL
+from services.evaluation.settings import command_line
 from services.evaluation.trained_networks import save_checkpoint
 from tests.unit.evaluation import toy
 from tests.unit.worlds.running import served
+
+
+def test_a_recorded_command_names_every_file_by_its_last_part():
+    for given, kept in (
+        (["--episodes", "runs/true,file:///data/imagined"], "--episodes true,imagined"),
+        (["--episodes=../a/b/,c", "--base=package"], "--episodes=b/,c --base=package"),
+        (["--held-out", '["runs/a", "runs/b"]'], """--held-out '["a", "b"]'"""),
+        (["--training.risk", "0.1", "--output", "/x/y.safetensors"],
+         "--training.risk 0.1 --output y.safetensors"),
+    ):  # fmt: skip
+        assert command_line("judge", given) == f"dextouch train judge {kept}"
+
+
+def test_factories_may_name_their_arguments_as_they_like(tmp_path, monkeypatch):
+    (tmp_path / "named_arguments.py").write_text(
+        "class Policy:\n"
+        "    def __init__(self, call, where):\n"
+        "        self.given = call, where\n"
+        "    def act(self, observation):\n"
+        "        return None\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    given = {"mine": {"call": 1, "where": 2}}
+    loaded = load_policies(["mine=named_arguments:Policy"], given, [], other_option="")
+    assert loaded["mine"].act.__self__.given == (1, 2)
 
 
 class Stuck(toy.ToyWorld):

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dextouch.clients import RolloutClient, http_link
+from dextouch.clients import PolicyStart, RolloutClient, http_link
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import ConflictError, InvalidInputError, UnavailableError
 from dextouch.schemas import Uncertainty
@@ -35,7 +35,7 @@ from services.evaluation.studies.results import (
 from services.evaluation.studies.study_figures import kept_pairs, write_reports
 from services.evaluation.success_classifier import SuccessClassifier
 from services.evaluation.trained_networks import save_checkpoint
-from tests.unit.evaluation import toy
+from tests.unit.evaluation import toy, toy_store
 from tests.unit.worlds.running import served
 
 pytestmark = pytest.mark.long
@@ -334,6 +334,20 @@ def test_a_study_has_bundled_policies(tmp_path):
     factory = PolicyFactory(definition_of(text, tmp_path), lambda _: pytest.fail("a script"))
     assert [type(one) for one in factory.load().values()] == [HoldPolicy, ColourServo]
     assert factory.training_starts() == factory.digests() == {}
+
+
+def test_a_study_may_keep_its_rollouts_in_the_store_that_it_replays(tmp_path):
+    store, item = EpisodeStore(tmp_path / "store"), toy.demonstration("reach", 2000)
+    toy_store.write(store, item)
+    text = STUDY.replace('factory = "toys:script"', f'replay = "{store.root}"')
+    study = definition_of(text, tmp_path)
+    before = PolicyFactory(study, lambda _: pytest.fail("a script")).digests()
+    for world, origin in (("real", "twin"), ("dream", "imagined")):
+        lineage = ({"kind": "rollout", "id": f"toy: script in {world}"},)
+        toy_store.write(store, item, episode_id=world, origin=origin, lineage=lineage)
+    again = PolicyFactory(study, lambda _: pytest.fail("a script"))
+    assert again.digests() == before
+    again.load()["script"].reset(PolicyStart("reach", "", 2000, toy.ANCHOR, toy.K_HEAD))
 
 
 def test_changed_policies_are_another_study(tmp_path, policy_checkpoint):

@@ -76,6 +76,18 @@ def test_names_are_text_in_every_format():
     assert r"b\_c" in policy_picture(pairs, "t & u", "tex").decode()
 
 
+def test_long_names_are_whole_in_every_format():
+    name = "behaviour_cloning_finetuned_on_imagined_episodes_of_2026_11_30_v2"
+    pairs = {name: [((0.2, 0.1, 0.5), (0.3, 0.2, 0.5))], "hold": [((0.0, 0.0, 0.5),) * 2]}
+    root = ET.fromstring(policy_picture(pairs, name, "svg"))  # noqa: S314 - ours
+    sizes = {one.text: float(one.get("font-size")) for one in root.iter(f"{SVG}text")}
+    assert sizes["hold"] == 9.0
+    # Letters are about 0.6 of their size wide; the picture is 260 points wide.
+    assert LEFT + 16 + 0.6 * sizes[name] * len(name) < 260
+    shown = np.asarray(Image.open(io.BytesIO(policy_picture(pairs, name, "png"))).convert("L"))
+    assert (shown[:, -8:] > 250).all()
+
+
 def test_png_has_300_dots_an_inch_and_the_marks(figures):
     image = Image.open(io.BytesIO(picture(figures, "blurred", "stand_bottle", "png")))
     np.testing.assert_allclose(image.info["dpi"], 300, rtol=1e-3)

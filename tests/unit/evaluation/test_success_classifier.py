@@ -94,9 +94,12 @@ def test_a_start_never_stands_on_both_sides(demonstrations):
 def test_it_is_measured_on_the_held_out_episodes_it_is_given(demonstrations):
     settings = ClassifierSettings(num_training_steps=1)
     others = toy.demonstrations(range(900, 920), noise_m=0.03)
+    unknown = toy.replace(_episodes(others)[0], task="juggle", instruction="Juggle.")
     checkpoint = train_success_classifier(
-        _episodes(demonstrations), settings, command="x", held_out=_episodes(others)
+        _episodes(demonstrations), settings, command="x", held_out=[*_episodes(others), unknown]
     )
+    # What it was not trained for is not evaluated by default, either.
+    assert set(checkpoint.metadata.settings["instructions"]) == set(toy.TASKS)
     assert len(checkpoint.metadata.training_episodes) == len(demonstrations)
     metrics, probe = checkpoint.metadata.metrics, SuccessClassifier(checkpoint)
     for task in toy.TASKS:
@@ -144,4 +147,10 @@ def test_a_probe_with_spoiled_probabilities_is_calibrated_to_what_happened(
     last = [one.endings[max(one.endings)] for one in episodes]
     rate = sum(one.success for one in episodes) / len(episodes)
     assert SuccessClassifier(base).probabilities(last).mean() > rate + 0.2
+    mine, other = calibrated.metadata.tasks
+    part = [one for one in episodes if one.task == mine]
+    partly = calibrate_success_classifier(base, part, ClassifierSettings(), command="test")
+    found = partly.metadata.settings["calibration"]
+    assert found[f"{other}/true"] == settings["calibration"][f"{other}/true"]
+    assert found[f"{mine}/true"] != settings["calibration"][f"{mine}/true"]
     assert SuccessClassifier(calibrated).probabilities(last).mean() == pytest.approx(rate, abs=0.08)

@@ -7,6 +7,7 @@ import pytest
 
 from dextouch.clients import RolloutClient
 from dextouch.episodes import EpisodeStore, check_id
+from dextouch.errors import InvalidInputError
 from dextouch.images import scaled_square
 from dextouch.schemas import EVERYTHING, Uncertainty
 from dextouch.worlds import CopyFirstWorld, SteppedRollout, WorldServiceSettings, create_world_app
@@ -64,6 +65,17 @@ def test_an_imagined_episode_shows_what_the_world_showed(sources, client, tmp_pa
     )
     np.testing.assert_array_equal(window.tactile_kpa[40], truth.tactile_kpa[0])
     np.testing.assert_allclose(window.actions, truth.actions, atol=1e-9)
+
+
+def test_an_episode_of_another_rate_is_refused(sources, tmp_path):
+    fast = CopyFirstWorld(tasks=("stack_bowls",), model_rate_hz=30.0)
+    app = create_world_app({"fast": fast}, WorldServiceSettings())
+    with (
+        served({"worlds": app}) as urls,
+        RolloutClient(urls["worlds"]) as client,
+        pytest.raises(InvalidInputError, match="at 15 steps a second, expected 30"),
+    ):
+        imagine_episode(sources[0], client, "fast", EpisodeStore(tmp_path))
 
 
 class _PoseWorld(CopyFirstWorld):

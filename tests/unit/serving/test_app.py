@@ -27,7 +27,7 @@ from dextouch.serving import (
     takes,
     timed,
 )
-from dextouch.serving.guard import header
+from dextouch.serving.guard import header, media_type
 from dextouch.serving.keys import ApiKey
 
 CASES = [
@@ -281,6 +281,29 @@ async def test_request_id_is_kept_when_sane_and_timing_is_told():
     assert len(replaced.headers["x-request-id"]) == 32
     assert kept.headers["server-timing"].startswith("read;dur=")
     assert "total;dur=" in kept.headers["server-timing"]
+
+
+@pytest.mark.parametrize("parameter", ["a*=x; a*0=y", f"a*{'1' * 5000}=x", "a*0*=x; a*1*=%ff"])
+async def test_odd_parameters_of_a_media_type_are_ignored(parameter):
+    async with client_of(make_app()) as client:
+        for kind, status in ((OCTETS, 200), ("text/html", 415)):
+            headers = {"content-type": f"{kind}; {parameter}"}
+            assert (await client.post("/raw", content=b"ab", headers=headers)).status_code == status
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "a/b; dtype=float32",
+        "a/b;dtype=FLOAT32",
+        'A/B ; x=" " ; dtype = "float32"; y',
+        "a/b;dtype=float32;",
+    ],
+)
+def test_media_types_and_their_parameters(text):
+    kind, parameters = media_type(text)
+    assert kind == "a/b"
+    assert parameters["dtype"] == "float32"
 
 
 async def test_keys_open_only_what_their_scopes_name():

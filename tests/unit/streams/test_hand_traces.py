@@ -76,6 +76,31 @@ def test_a_tracker_that_stands_still_while_its_fingers_move(noise_m):
         assert "wrist_left" not in found(streams)
 
 
+def test_wrists_that_are_not_single_poses_say_nothing():
+    traces, t_ns = HandTraces(), np.arange(5)
+    for shape in ((5, 2, 7), (5, 6), (5,)):
+        traces.add("wrist_left", t_ns, np.zeros(shape))
+    assert traces.found() == {}
+
+
+def test_a_tracker_that_stands_still_half_turned():
+    """Noise changes the sign of a quaternion whose w is zero."""
+    for seed in SEEDS:
+        streams, rng = hands(seed, seconds=15), np.random.default_rng(seed)
+        poses = streams["wrist_left"]
+        poses[:] = [0.1, 0.2, 1.0, 0.0, 1.0, 0.0, 0.0] + 1e-4 * rng.standard_normal(poses.shape)
+        poses[::2, 3:] *= -1
+        poses[0] = np.nan
+        assert found(streams) == {"wrist_left": "frozen"}
+
+
+def test_hands_with_other_nodes_say_nothing():
+    streams = hands(0)
+    for side in SIDES:
+        streams[f"keypoints_{side}"] = streams[f"keypoints_{side}"][:, :21]
+    assert found(streams) == {}
+
+
 @pytest.mark.parametrize("noise_m", [1e-4, 3e-4, 2e-3])
 @pytest.mark.parametrize("seconds", [5, 15, 30])
 def test_a_living_wrist_at_rest_is_not_still(noise_m, seconds):

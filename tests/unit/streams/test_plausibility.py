@@ -325,6 +325,22 @@ def test_joints_in_degrees_beyond_their_limits_and_within_them():
     )
 
 
+@pytest.mark.parametrize("unit", ["rad", "deg"])
+def test_joints_are_in_radians_whatever_their_unit_says(unit):
+    lower, upper = hands()
+    share = gaussian_filter1d(np.random.default_rng(0).random((600, 40)), 20, axis=0)
+    about = StreamDescriptor(
+        name="joints_measured", kind="robot_state", shape=(40,), dtype="float64", unit=unit,
+        nominal_rate_hz=100,
+    )  # fmt: skip
+    joints, t_ns = lower + (upper - lower) * share, np.arange(600) * 10_000_000
+    (degrees,) = implausible_values(about, t_ns, np.degrees(joints), of_robot=True)
+    assert (degrees.cause, degrees.whole) == ("unit", True)
+    # Such as their currents.
+    other = about.model_copy(update={"name": "currents", "unit": "A"})
+    assert implausible_values(other, t_ns, np.degrees(joints), of_robot=True) == []
+
+
 def test_commands_may_press_beyond_limits_but_are_in_radians():
     lower, upper = hands()
     joints = np.tile((lower + upper) / 2, (600, 1))

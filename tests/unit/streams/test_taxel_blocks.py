@@ -1,5 +1,6 @@
 """Faults of a whole glove, of a pad or of a row, made on the readings of mock gloves."""
 
+import sys
 import warnings
 
 import numpy as np
@@ -161,6 +162,84 @@ def test_readings_that_end_at_a_limit(top):
         ends = (counts >= top).mean(axis=0)[calibration.cells]
         named = found(calibration, np.minimum(counts, top))["saturated"]
         assert set(np.flatnonzero(ends > 0.05)) <= set(named) <= set(np.flatnonzero(ends > 0.01))
+
+
+ROWS, COLUMNS = np.mgrid[:15, :16] + 0.5
+RADII = np.hypot(ROWS - 7.5, COLUMNS - 7.5)
+HARD = {
+    "two ridges": np.isin(COLUMNS, (6.5, 8.5)),
+    "a fork": np.isin(COLUMNS, (4.5, 6.5, 8.5, 10.5)) & (ROWS > 3),
+    "a ring round a taxel": (RADII > 0) & (RADII < 1.5),
+    "a plate with a hole": (RADII > 1) & (RADII < 5),
+    "the edge of a box": COLUMNS > 6,
+    "a pen": abs(ROWS - COLUMNS) < 1.1,
+}
+
+
+def touched(seed, palms, deaf=()):
+    """24 s in which a palm [15, 16] of kPa presses in each 2 s; deaf taxels show noise only."""
+    calibration, _ = take(seed, seconds=1)
+    press = np.sin(np.linspace(0, np.pi, 120))[:, None]
+    kpa = np.zeros((120 * len(palms), 320))
+    kpa[:, 80:] = np.concatenate([press * palm.ravel() for palm in palms])
+    kpa[:, list(deaf)] = 0.0
+    counts = np.full((len(kpa), 360), 500.0)
+    counts[:, calibration.cells] = calibration.tare_counts + kpa * calibration.gain_counts_per_kpa
+    return found(
+        calibration, np.rint(counts + np.random.default_rng(seed).normal(size=counts.shape))
+    )
+
+
+@pytest.mark.parametrize("kind", HARD)
+def test_gaps_of_hard_things_are_not_deaf(kind):
+    """Gripped ever again at one place, or a taxel beside it."""
+    for seed, reach in enumerate((0, 1)):
+        rng = np.random.default_rng(seed)
+        shifts, forces = rng.integers(-reach, reach + 1, (12, 2)), rng.uniform(10, 60, 12)
+        palms = [
+            force * np.roll(HARD[kind], shift, (0, 1))
+            for force, shift in zip(forces, shifts, strict=True)
+        ]
+        assert "dead" not in touched(seed, palms)
+
+
+@pytest.mark.parametrize(("kpa", "least"), [(8.0, 0), (15.0, 6), (40.0, 8)])
+def test_deaf_taxels_among_soft_touches_are_found(kpa, least, capsys):
+    deaf, num_found = (80 + 7 * 16 + 7, 80 + 7 * 16 + 8), 0
+    for seed in range(8):
+        spots = np.random.default_rng(seed).uniform((4, 4), (11, 12), (12, 2))
+        palms = [kpa * np.exp(-((ROWS - r) ** 2 + (COLUMNS - c) ** 2) / 8) for r, c in spots]
+        named = touched(seed, palms, deaf).get("dead", ())
+        assert set(named) <= set(deaf)
+        num_found += len(named) == 2
+    with capsys.disabled():
+        sys.stdout.write(f"\ntwo deaf taxels, touches of {kpa:g} kPa: found {num_found} of 8")
+    assert num_found >= least
+
+
+def three_grasps(deaf=(), *, is_whole_hand=True):
+    """5 min with three soft grasps of 2 s by all taxels, or by the palm and a finger."""
+    calibration, _ = take(0, seconds=1)
+    kpa = np.zeros((300 * 60, 320))
+    touching = slice(0, 320) if is_whole_hand else slice(64, 320)
+    for first in (1800, 7200, 14_400):
+        kpa[first : first + 120, touching] = 15 * np.sin(np.linspace(0, np.pi, 120))[:, None]
+    kpa[:, list(deaf)] = 0.0
+    counts = np.full((len(kpa), 360), 500.0)
+    counts[:, calibration.cells] = calibration.tare_counts + kpa * calibration.gain_counts_per_kpa
+    return found(calibration, np.rint(counts + np.random.default_rng(0).normal(size=counts.shape)))
+
+
+@pytest.mark.parametrize("is_whole_hand", [True, False])
+def test_taxels_that_are_seldom_touched_are_not_deaf(is_whole_hand):
+    assert three_grasps(is_whole_hand=is_whole_hand) == {}
+
+
+@pytest.mark.parametrize("is_whole_hand", [True, False])
+def test_deaf_taxels_of_a_take_with_few_grasps_are_found(is_whole_hand):
+    deaf = [80 + 7 * 16 + 7, 80 + 7 * 16 + 8]
+    named = three_grasps(deaf, is_whole_hand=is_whole_hand)
+    assert {cause: taxels.tolist() for cause, taxels in named.items()} == {"dead": deaf}
 
 
 @pytest.mark.parametrize(

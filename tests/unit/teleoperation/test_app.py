@@ -182,6 +182,7 @@ def test_a_second_controller_is_refused_until_the_first_is_gone(url):
         ),
         (message({"start": {}}), "joints missing or unknown: r_index_finger_dip"),
         (message({"start": REST | {"r_thumb_ip": "far"}}), "expected a map of joint names"),
+        (message({"start": {b"r_thumb_ip": 0.0}}), "expected a map of joint names"),
         (message({"start": REST | {"r_thumb_ip": 3.0}}), "joint r_thumb_ip: got 3.000 rad"),
     ],
 )
@@ -198,8 +199,13 @@ def test_a_message_that_is_none_is_told_in_a_command_and_changes_nothing(url, gi
 
 @pytest.mark.parametrize(
     "given",
-    [sample_message(0), message({"start": {"r_thumb_ip": 0.0}}), "text"],
-    ids=["sample", "some joints", "text"],
+    [
+        sample_message(0),
+        message({"start": {"r_thumb_ip": 0.0}}),
+        message({"start": REST | {"親指" * 20: 0.0}}),
+        "text",
+    ],
+    ids=["sample", "some joints", "other letters", "text"],
 )
 def test_a_hand_that_was_not_started_gets_no_command(url, given):
     with controller(url) as robot:

@@ -127,6 +127,25 @@ def test_what_is_no_fresh_sample_of_this_hand_leads_to_a_hold(run, change, reque
     assert not np.isnan(run.joints_rad()).any()
 
 
+def test_the_time_of_samples_that_do_not_fit_is_counted_once(run, monkeypatch):
+    """Else a finger is taken for lost, and searched anew, after 50 instead of 100 ms."""
+    first, elapsed_s, retargeter = run.index, [], run.follower._retargeter
+    step = retargeter.step
+
+    def counted(keypoints_m, since_s):
+        elapsed_s.append(since_s)
+        return step(keypoints_m, since_s)
+
+    def large(index):
+        given = sample(index)
+        return replace(given, keypoints_m=given.keypoints_m * (2 if index < first + 3 else 1))
+
+    monkeypatch.setattr(retargeter, "step", counted)
+    run.play(0.1, large)
+    assert run.follower.refused["implausible"] == 3
+    assert elapsed_s == pytest.approx([1 / 60] * 6)
+
+
 def test_a_burst_after_a_stall_is_followed_from_its_newest_sample(run):
     first = run.index
     run.play(0.5, lost)

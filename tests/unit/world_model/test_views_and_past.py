@@ -15,6 +15,8 @@ from dextouch.errors import ConflictError, InvalidInputError, ShapeError
 from dextouch.hands.actions import CAMERA_HEAD, reanchor
 from dextouch.schemas import ReturnSelector, StartRequest, decode_answer, encode_start
 from dextouch.worlds import create_world_app
+from services.evaluation.recorded_takes import read_takes
+from services.pipelines import evaluate
 from services.world_model.checkpoints import read_checkpoint, write_checkpoint
 from services.world_model.joint_world import JointWorld
 from services.world_model.network.inputs import MAX_KEPT, PastRule, build_inputs
@@ -378,7 +380,7 @@ def stored(tmp_path):
     for seed in range(6):
         episode = with_wrists(make_episode(seed))
         further = (episode.further[0], None) if seed == 5 else episode.further
-        write_episode(store, replace(episode, further=further))
+        write_episode(store, replace(episode, further=further), success=True)
     return store
 
 
@@ -427,6 +429,49 @@ def test_training_with_both_is_that_in_parts_and_can_be_resumed(
     other = given.model_copy(update={"init": given.output, "network": tiny_config})
     with pytest.raises(ConflictError, match="past_images"):
         joint_trainer.train(other)
+
+
+def test_a_model_that_may_lack_views_still_may_after_further_training(
+    train_settings, tiny_config, tmp_path
+):
+    config = tiny_config.model_copy(update={"further_views": (LEFT, RIGHT)})
+    trained, heldout = ([with_wrists(make_episode(s)) for s in part] for part in ((0, 1), (2,)))
+    first = train_settings.model_copy(update={"network": config, "max_steps": 1})
+    joint_trainer.train_on(trained, heldout, first)
+    windows = first.windows.model_copy(update={"view_dropout": 0.0})
+    adapted = first.model_copy(
+        update={
+            "init": first.output,
+            "output": tmp_path / "adapted.safetensors",
+            "windows": windows,
+            "new_tasks": False,
+        }
+    )
+    joint_trainer.train_on(trained, heldout, adapted)
+    checkpoint = read_checkpoint(adapted.output)
+    assert checkpoint.metadata.view_dropout == 0.1
+    JointWorld(checkpoint).reset(start_of(heldout[0], LEFT))
+    always = adapted.model_copy(update={"init": None})
+    joint_trainer.train_on(trained, heldout, always)
+    assert read_checkpoint(always.output).metadata.view_dropout == 0.0
+
+
+def test_recorded_takes_start_with_the_views_that_the_world_sees(
+    stored, world, tmp_path, monkeypatch
+):
+    takes = read_takes([stored], further_views=world.description.optional_cameras)
+    seen = {take.episode_id: set(take.start.observation.images) for take in takes}
+    assert seen.pop("toy-5") == {"camera_head", LEFT}
+    assert list(seen.values()) == 5 * [{"camera_head", LEFT, RIGHT}]
+    assert set(read_takes([stored])[0].start.observation.images) == {"camera_head"}
+
+    def asked(stores, *, further_views, **options):
+        raise InvalidInputError(f"asked for {further_views}")
+
+    monkeypatch.setattr(evaluate, "read_takes", asked)
+    words = ["--episodes", str(stored.root), "--checkpoint", str(tmp_path / "seeing.safetensors")]
+    with pytest.raises(InvalidInputError, match=f"asked for .*{LEFT}.*{RIGHT}"):
+        evaluate.recorded_main(words)
 
 
 def test_episodes_without_a_needed_view_are_refused_by_name(stored, train_settings, tiny_config):

@@ -5,10 +5,13 @@ from contextlib import contextmanager
 import msgpack
 import numpy as np
 import pytest
+from fastapi.testclient import TestClient
+from starlette.websockets import WebSocketDisconnect
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
 from dextouch.clients import RolloutClient
+from dextouch.errors import AccessDeniedError
 from dextouch.worlds import CopyFirstWorld, WorldServiceSettings, create_world_app
 from dextouch.worlds.openpi import largest_message
 from services.pipelines.servers import served as serve
@@ -236,14 +239,34 @@ def test_the_limit_of_a_message_is_what_worlds_need():
     assert limit(scales_images=True) == 2**24
 
 
+def test_the_reason_of_a_refusal_fits_its_frame(monkeypatch):
+    app = create_world_app({"sum": fakes.SumWorld()}, WorldServiceSettings())
+
+    def refuse(*_args):
+        raise AccessDeniedError("é" * 200)
+
+    monkeypatch.setattr(app.state.access, "check", refuse)
+    client = TestClient(app, base_url="http://localhost")
+    url = "ws://localhost/v1/openpi"
+    with pytest.raises(WebSocketDisconnect) as caught, client.websocket_connect(url):
+        pass
+    assert caught.value.reason == "é" * 61
+
+
 def test_a_key_with_the_scope_is_needed_where_keys_are_set():
     keys = (
         {"name": "policy", "key": KEY, "scopes": ["rollout"]},
         {"name": "reader", "key": KEY[::-1], "scopes": ["read"]},
     )
     settings = WorldServiceSettings.model_validate({"api_keys": keys})
-    with served(create_world_app({"sum": fakes.SumWorld()}, settings)) as url:
+    app = create_world_app({"sum": fakes.SumWorld()}, settings)
+    with served(app) as url:
         with opened(url, KEY) as client:
+            assert client.infer({"start": START})["rollout"]["next_chunk"] == 0
+            app.state.access.set_keys(settings.api_keys[1:])
+            with pytest.raises(RuntimeError, match="unknown key"):
+                client.infer({"start": START})
+            app.state.access.set_keys(settings.api_keys)
             assert client.infer({"start": START})["rollout"]["next_chunk"] == 0
         for key in (None, "another-key-of-letters", KEY[::-1]):
             with pytest.raises((InvalidStatus, ConnectionClosed)), opened(url, key):

@@ -4,6 +4,7 @@ import asyncio
 import threading
 
 import pytest
+from pydantic import ValidationError
 
 from dextouch.errors import (
     InvalidInputError,
@@ -13,11 +14,18 @@ from dextouch.errors import (
 )
 from dextouch.schemas import RolloutStart
 from dextouch.serving.state import MemoryState, RedisState
+from dextouch.worlds.settings import RolloutLimits
 from tests.unit.worlds.begun import ALL, begin, service
 from tests.unit.worlds.fakes import (
     SumWorld,
     actions,
 )
+
+
+@pytest.mark.parametrize("ttl_s", [float("inf"), 1e9])
+def test_a_time_to_live_that_no_rollout_could_have_is_refused(ttl_s):
+    with pytest.raises(ValidationError, match="less than 1000000000"):
+        RolloutLimits(ttl_s=ttl_s)
 
 
 async def test_limits_on_number_and_length():

@@ -32,6 +32,7 @@ from dextouch.bridges.lerobot.layout import (
 from dextouch.bridges.lerobot.video import CameraVideo, encode_images, stored_units
 from dextouch.episodes import EpisodeReader, VideoSettings, disk_errors
 from dextouch.errors import ConflictError, InvalidInputError, ShapeError
+from dextouch.streams import StreamDescriptor
 from dextouch.tactile.layout import common_layout
 
 # Rows of the table of episodes that are written together.
@@ -49,10 +50,10 @@ class ExportOptions:
 
     `fps`: frames a second, a whole number; without it the model rate of the first episode.
     `cameras`: whose images go along, the first of them setting the frames' times when `fps` is its
-    own rate; without it all image streams of the first episode, the head's first. `touch_samples`:
-    also every touch sample since the frame before. `license_name`: identifier of the Hub for the
-    dataset's card. `existing`: what to do where the folder is a dataset already: refuse, replace
-    it, or append the episodes to it.
+    own rate; without it all of the first episode that have colours, the head's first.
+    `touch_samples`: also every touch sample since the frame before. `license_name`: identifier of
+    the Hub for the dataset's card. `existing`: what to do where the folder is a dataset already:
+    refuse, replace it, or append the episodes to it.
     """
 
     fps: int | None = None
@@ -70,13 +71,15 @@ class DatasetExport:
     """Result of an export; of an appended one the counts are those of the new episodes.
 
     `present` are episodes that the dataset had already, `num_touch_left_out` touch samples that did
-    not fit into their frame (`ExportOptions.touch_samples`).
+    not fit into their frame (`ExportOptions.touch_samples`), `cameras_left_out` those without
+    colours.
     """
 
     num_episodes: int
     num_frames: int
     present: tuple[str, ...] = ()
     num_touch_left_out: int = 0
+    cameras_left_out: tuple[str, ...] = ()
 
 
 def export_dataset(
@@ -96,12 +99,14 @@ def export_dataset(
         ConflictError: the folder exists, is no dataset, or was changed meanwhile.
         InvalidInputError: no episodes, a rate that is not an integer, or episodes that cannot share
             one dataset, such as with a camera that one of them lacks.
-        ShapeError: images with an odd side.
+        ShapeError: images with an odd side, or of a chosen camera without colours.
         CorruptDataError, StorageError: a damaged episode or dataset; the write failed.
     """
     if not REPO_ID.fullmatch(repo_id):
         raise InvalidInputError(f"repo_id: got {repo_id!r}, expected a name like 'user/name'")
     check_license(options.license_name)
+    # A link stays one, and what it names is exchanged where it lies.
+    folder = folder.resolve()
     before = _existing(folder, options)
     partial = folder.with_name(f".{folder.name}.{uuid.uuid4().hex}.partial")
     dataset: _Dataset | None = None
@@ -135,13 +140,14 @@ def _existing(folder: Path, options: ExportOptions) -> ExistingDataset | None:
     """The dataset to append to; raises ConflictError where the folder must not be changed."""
     if not folder.exists():
         return None
+    if not (folder / layout.INFO_FILE).is_file():
+        raise ConflictError(
+            f"{folder}: exists and is no LeRobot data set; choose another folder (--force and "
+            "--append leave it as it is)"
+        )
     if options.existing == "refuse":
         raise ConflictError(
             f"{folder}: exists already; choose another folder, or add --append or --force"
-        )
-    if not (folder / layout.INFO_FILE).is_file():
-        raise ConflictError(
-            f"{folder}: is not a LeRobot data set, so --force and --append leave it as it is"
         )
     return ExistingDataset.read(folder) if options.existing == "append" else None
 
@@ -211,9 +217,7 @@ class _Dataset:
         if not 1 <= self.fps <= 1000:
             raise InvalidInputError(f"fps: got {self.fps}, expected 1 … 1000")
         self._folder = folder
-        names = [name for name, stream in streams.items() if stream.kind == "image"]
-        heads_first = sorted(names, key=lambda name: (name != "camera_head", name))
-        self._cameras = options.cameras or tuple(heads_first)
+        self._cameras, self._cameras_left_out = _chosen_cameras(first, options)
         _check_cameras(first, self._cameras)
         self._has_measured = "action_commanded" in streams
         shapes = {name: streams[name].shape for name in self._cameras}
@@ -359,7 +363,9 @@ class _Dataset:
         if self._before is not None:
             num_frames -= self._before.num_frames
             num_episodes -= len(self._before.source.episodes)
-        return DatasetExport(num_episodes, num_frames, present, self._num_left_out)
+        return DatasetExport(
+            num_episodes, num_frames, present, self._num_left_out, self._cameras_left_out
+        )
 
     def finish(self, repo_id: str, license_name: str | None) -> None:
         """Complete the files and write the metadata; raises StorageError if the write failed."""
@@ -449,6 +455,22 @@ def _num_samples(
     return max(most, math.ceil(1.5 * max(rates_hz) / fps))
 
 
+def _chosen_cameras(
+    first: EpisodeReader, options: ExportOptions
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """The cameras of a dataset, and those left out since they have no colours."""
+    if options.cameras:
+        return options.cameras, ()
+    names = [name for name, stream in first.streams.items() if stream.kind == "image"]
+    heads_first = sorted(names, key=lambda name: (name != "camera_head", name))
+    colours = tuple(name for name in heads_first if _has_colours(first.streams[name]))
+    return colours, tuple(name for name in heads_first if name not in colours)
+
+
+def _has_colours(stream: StreamDescriptor) -> bool:
+    return stream.dtype == "uint8" and stream.shape[2:] == (3,)
+
+
 def _check_cameras(reader: EpisodeReader, cameras: tuple[str, ...]) -> None:
     images = [name for name, stream in reader.streams.items() if stream.kind == "image"]
     missing = [name for name in cameras if name not in images]
@@ -458,7 +480,13 @@ def _check_cameras(reader: EpisodeReader, cameras: tuple[str, ...]) -> None:
             "choose cameras that all episodes have"
         )
     for name in cameras:
-        height_px, width_px = reader.streams[name].shape[:2]
+        dtype, shape = reader.streams[name].dtype, reader.streams[name].shape
+        if not _has_colours(reader.streams[name]):
+            raise ShapeError(
+                f"camera {name!r}: got {dtype} {[*shape]}, expected uint8 [h, w, 3] of colours; "
+                "leave it out (`ExportOptions.cameras`), or export the episode as MCAP"
+            )
+        height_px, width_px = shape[:2]
         if height_px % 2 or width_px % 2:
             raise ShapeError(
                 f"camera {name!r}: got images of {height_px} x {width_px} pixels, expected even "

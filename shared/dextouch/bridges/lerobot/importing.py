@@ -1,7 +1,7 @@
 """Import of LeRobot datasets: those with our actions as episodes, all others as recordings."""
 
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
@@ -155,7 +155,7 @@ def _importer(
     """The result, still empty, and what adds an episode to it."""
     folder = source.folder
     first = source.sidecar(source.episodes[0]) if source.episodes else None
-    features, missing = _map_features(source.info, options.mapping, _tactile_layout(first))
+    features, missing = _map_features(source.info, options.mapping, first)
     if first is None and missing:
         result = DatasetImport("recording", notes=[f"imported as recordings: {'; '.join(missing)}"])
         write = recordings_importer(source, store, options)
@@ -234,7 +234,7 @@ def _tactile_layout(sidecar: layout.Sidecar | None) -> TactileLayout:
 
 
 def _map_features(
-    info: DatasetInfo, names: Mapping[str, str], tactile: TactileLayout
+    info: DatasetInfo, names: Mapping[str, str], first: layout.Sidecar | None
 ) -> tuple[dict[str, str], list[str]]:
     """The dataset's features by role, and why it has no episodes of ours (empty if it has)."""
     for theirs in names.values():
@@ -242,8 +242,9 @@ def _map_features(
             raise UnknownNameError("feature of the dataset (--map)", theirs, list(info.features))
     roles: dict[str, str] = {}
     problems = []
+    num_taxels = _tactile_layout(first).num_taxels
     for ours, (usual, sizes) in _ROLES.items():
-        shape = tuple(tactile.num_taxels if size < 0 else size for size in sizes)
+        shape = tuple(num_taxels if size < 0 else size for size in sizes)
         name = names.get(ours, usual)
         got = info.features.get(name)
         if got is not None and got.dtype in {"float32", "float64"} and got.numbers() == shape:
@@ -251,8 +252,9 @@ def _map_features(
         elif ours == "action" or ours in names:
             said = f"{name!r} is {_describe(got)}, expected float32 {[*shape]}" if got else ""
             problems.append(f"{ours!r}: {said or f'no feature {name!r}'}")
-    cameras = _cameras(info, names)
-    if HEAD_CAMERA not in cameras:
+    exported = None if first is None else first.cameras
+    cameras = _cameras(info, names, exported or ())
+    if HEAD_CAMERA not in cameras and (exported is None or HEAD_CAMERA in exported):
         problems.append(
             f"{HEAD_CAMERA!r}: no feature {layout.IMAGES + HEAD_CAMERA!r} "
             f"(--map {HEAD_CAMERA}=FEATURE)"
@@ -265,15 +267,16 @@ def _map_features(
     return roles | cameras, problems
 
 
-def _cameras(info: DatasetInfo, names: Mapping[str, str]) -> dict[str, str]:
-    """Cameras under our own names, and those given by the mapping."""
+def _cameras(
+    info: DatasetInfo, names: Mapping[str, str], exported: Collection[str]
+) -> dict[str, str]:
+    """Cameras under our own names or those of an export, and those given by the mapping."""
     own = {
-        name.removeprefix(layout.IMAGES): name
+        ours: name
         for name, feature in info.features.items()
-        if name.startswith(layout.IMAGES)
-        and _CAMERA_NAME.fullmatch(name.removeprefix(layout.IMAGES))
-        and feature.is_camera()
-        and name not in names.values()
+        if name.startswith(layout.IMAGES) and feature.is_camera() and name not in names.values()
+        for ours in [name.removeprefix(layout.IMAGES)]
+        if ours in exported or _CAMERA_NAME.fullmatch(ours)
     }
     given = {o: t for o, t in names.items() if o not in _ROLES and _CAMERA_NAME.fullmatch(o)}
     return own | given

@@ -41,7 +41,6 @@ from dextouch.errors import (
     StorageError,
     UnknownNameError,
 )
-from dextouch.free_text import check_line
 from dextouch.schemas import (
     MAX_NOTES,
     EditedItem,
@@ -51,6 +50,7 @@ from dextouch.schemas import (
     ItemNotes,
     LineageEntry,
     NewNote,
+    RelabelItems,
     TimedNote,
     first_problems,
     json_ready,
@@ -77,6 +77,7 @@ class EditOptions:
 
 
 DEFAULTS = EditOptions()
+_RELABELLED = ("task", "instruction", "operator")
 
 
 @dataclass
@@ -301,10 +302,6 @@ def remove_note(
     return store.change_notes(item_id, remove, kind=kind)
 
 
-# Attributes that can be changed, beside the outcome.
-LABELS = ("task", "instruction", "operator")
-
-
 def relabel_item(
     store: EpisodeStore,
     item_id: str,
@@ -321,7 +318,7 @@ def relabel_item(
     Args:
         store: where the item is.
         item_id: of the source.
-        changes: new values of some of `task`, `instruction` and `operator`.
+        changes: new values of some of `task`, `instruction` and `operator`, as in `RelabelItems`.
         kind: of the item.
         outcome: new outcome; another task must be given one, if the item was judged.
         options: of all edits.
@@ -330,6 +327,15 @@ def relabel_item(
         InvalidInputError: nothing changes, a value is invalid, or the outcome is lacking.
         NotFoundError, CorruptDataError, ConflictError, UnavailableError: as `trim_episode`.
     """
+    if any(key not in _RELABELLED or text is None for key, text in changes.items()):
+        raise InvalidInputError(
+            f"relabel {kind} {item_id!r}: got {dict(changes)}, expected texts of task, instruction "
+            "or operator"
+        )
+    try:
+        RelabelItems.model_validate({"items": [{"kind": kind, "id": item_id}], **changes})
+    except ValidationError as error:
+        raise InvalidInputError(f"relabel {kind} {item_id!r}: {first_problems(error)}") from error
     with store.held(item_id, kind=kind):
         reader = store.open_item(kind, item_id)
         about = reader.attributes
@@ -361,13 +367,6 @@ def relabel_item(
             fields = {**fields, "event_times_s": {}}
         fields = fields | {f"{kind}_id": edit.new_id, "lineage": edit.lineage}
         attributes = about.model_copy(update=fields)
-        try:
-            for value in changed.values():
-                check_line(value)
-            type(about).model_validate(dict(attributes))
-        except ValueError as error:
-            why = first_problems(error) if isinstance(error, ValidationError) else str(error)
-            raise InvalidInputError(f"relabel {kind} {item_id!r}: {why}") from error
         metadata, commit = with_attributes(store.files(item_id, kind=kind), attributes)
 
         def write(writer: EpisodeWriter) -> None:

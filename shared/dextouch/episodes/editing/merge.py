@@ -351,5 +351,6 @@ def copy_item(
         for remark, found in remarks.items():
             if found is not None:
                 writer.add_remark(remark, found)
-        if replaces and target.exists(name, kind=kind):
-            target.delete(name, kind=kind)
+        if replaces:
+            with suppress(NotFoundError):
+                target.delete(name, kind=kind)

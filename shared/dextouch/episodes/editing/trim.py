@@ -141,7 +141,10 @@ def _trimmed_attributes(
     }
     if lost := sorted(set(about.event_times_s) - set(events)):
         edit.messages.append(f"events outside are left out: {', '.join(lost)}")
-    calibration = _cut_intervals(about.calibration, zero_s, last_s + 1.0 / about.model_rate_hz)
+    # On the episode's clock, on which step 0 need not be at 0.
+    origin_s = int(grid_ns[0]) * 1e-9
+    span_s = origin_s + zero_s, origin_s + last_s + 1.0 / about.model_rate_hz
+    calibration = _cut_intervals(about.calibration, span_s, zero_s)
     quality = {name: n for name, n in about.quality.items() if name.endswith(_OF_EVERY_PART)}
     if "origin_after_start_ns" in about.quality:
         start_ns = about.quality["origin_after_start_ns"] + round(zero_s * 1e9)
@@ -157,17 +160,17 @@ def _trimmed_attributes(
 
 
 def _cut_intervals(
-    calibration: Mapping[str, Matrix], zero_s: float, stop_s: float
+    calibration: Mapping[str, Matrix], span_s: tuple[float, float], shift_s: float
 ) -> dict[str, Matrix]:
-    """A calibration with its interpolated intervals cut to a span, on a clock from its start."""
-    found = dict(calibration)
+    """A calibration with its interpolated intervals cut to a span, on a clock that is behind."""
+    found, (start_s, stop_s) = dict(calibration), span_s
     for name in calibration:
         if not (name.startswith("interpolated_") and name.endswith("_s")):
             continue
         rows = [
-            (max(start, zero_s) - zero_s, min(end, stop_s) - zero_s, *rest)
+            (max(start, start_s) - shift_s, min(end, stop_s) - shift_s, *rest)
             for start, end, *rest in calibration[name]
-            if start < stop_s and end > zero_s
+            if start < stop_s and end > start_s
         ]
         if rows:
             found[name] = tuple(rows)

@@ -1,6 +1,7 @@
 """Inspection of a store for damage, and repair from a copy or by salvage of what is whole."""
 
 import json
+import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -368,7 +369,7 @@ def _write_salvaged(
     with EpisodeWriter(
         stage=new_stage(root, kind, free),
         target=root / f"{kind}s" / free,
-        attributes=attributes.model_copy(update=update | _counted(attributes, lost)),
+        attributes=attributes.model_copy(update=update | _changed(attributes, streams, lost)),
     ) as writer:
         for stream in streams:
             for values, stamps in stream.blocks():
@@ -401,11 +402,26 @@ def _supersede_sources(root: Path, attributes: Attributes, new_id: str) -> None:
             store.change_source_review(entry, change)
 
 
-def _counted(attributes: Attributes, lost: Mapping[str, int]) -> dict[str, object]:
-    """Where attributes count dropped samples: the quality of an episode, the ledger of a take."""
+def _changed(
+    attributes: Attributes, streams: Sequence[SalvagedStream], lost: Mapping[str, int]
+) -> dict[str, object]:
+    """Milestones within the steps left, from their first, and where dropped samples are counted.
+
+    They are in the quality of an episode and in the ledger of a take.
+    """
     if isinstance(attributes, EpisodeAttributes):
         figures = {f"{name}_{LOST}": float(count) for name, count in lost.items()}
-        return {"quality": attributes.quality | figures}
+        steps = next((one.kept for one in streams if one.descriptor.name == "action"), None)
+        first_s, last_s = 0.0, math.inf
+        if steps is not None:
+            kept = np.flatnonzero(steps)
+            first_s, last_s = (int(kept[end]) / attributes.model_rate_hz for end in (0, -1))
+        times_s = {
+            name: t - first_s
+            for name, t in attributes.event_times_s.items()
+            if first_s <= t <= last_s
+        }
+        return {"quality": attributes.quality | figures, "event_times_s": times_s}
     entries = (LedgerEntry(stream=name, event=LOST, count=count) for name, count in lost.items())
     return {"ledger": (*attributes.ledger, *entries)}
 

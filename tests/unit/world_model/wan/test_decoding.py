@@ -69,6 +69,30 @@ def test_frames_that_no_image_depends_on_are_not_computed(decoder):
     ]
 
 
+def test_before_the_last_block_the_last_image_depends_on_every_frame(decoder):
+    """So that no exact decoding does without them: gradients of diffusers' own decoder."""
+    given = {block: [] for block in decoder.decoder.up_blocks}
+    hooks = [
+        block.register_forward_pre_hook(lambda block, args: given[block].append(args[0]))
+        for block in given
+    ]
+    latents = latents_of(5).requires_grad_()
+    last = decoder.decode(latents).sample[:, :, -1].sum()
+    for hook in hooks:
+        hook.remove()
+
+    def needed(parts):
+        found = torch.autograd.grad(last, parts, retain_graph=True, materialize_grads=True)
+        return torch.cat(found, dim=2).abs().amax((0, 1, 3, 4)) > 0
+
+    assert needed([latents]).all()
+    *early, late = given.values()
+    assert [len(needed(parts)) for parts in given.values()] == [5, 9, 17, 17]
+    assert all(needed(parts).all() for parts in early)
+    # Two for each convolution of three frames after it.
+    assert needed(late).sum() == 1 + 2 * (2 * len(decoder.decoder.up_blocks[-1].resnets) + 1)
+
+
 def test_a_window_decodes_the_latest_latents_as_a_video_of_their_own(wan_config, autoencoder):
     codec = WanVideoCodec(wan_config)
     codec.autoencoder = autoencoder
