@@ -275,7 +275,7 @@ def test_a_replacement_that_fails_leaves_the_old_dataset(store, folder, monkeypa
         export_dataset([episode(store, 4)], folder, repo_id="lab/touch", options=options)
     assert hashes(folder) == before
     (folder / INFO).unlink()
-    with pytest.raises(ConflictError, match="is no LeRobot data set"):
+    with pytest.raises(ConflictError, match="is not a LeRobot data set"):
         export_dataset([episode(store, 5)], folder, repo_id="lab/touch", options=options)
 
 

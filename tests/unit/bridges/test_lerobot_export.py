@@ -280,7 +280,7 @@ def test_an_existing_folder_and_a_strange_name_are_refused(store, folder):
     readers = two(store)
     folder.mkdir(parents=True)
     # No advice that would be refused, too.
-    with pytest.raises(ConflictError, match="is no LeRobot data set; choose another folder"):
+    with pytest.raises(ConflictError, match="is not a LeRobot data set; choose another folder"):
         export_dataset(readers, folder, repo_id="touch")
     for name in ("", "a/b/c", "../x", "a b"):
         with pytest.raises(InvalidInputError, match="repo_id"):

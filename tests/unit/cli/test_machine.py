@@ -272,7 +272,7 @@ def test_ours_over_that_of_others_is_in_order(opencv):
 def test_files_that_another_build_took_along_are_missed(opencv):
     (found,) = opencv({"opencv-contrib-python-headless": "4.14.0.94"}, None)
     assert found.found.startswith("damaged")
-    assert " pip install --force-reinstall " in found.do
+    assert "pip install --force-reinstall " in found.do
 
 
 def test_without_opencv_nothing_is_said(opencv):

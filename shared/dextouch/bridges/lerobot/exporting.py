@@ -142,7 +142,7 @@ def _existing(folder: Path, options: ExportOptions) -> ExistingDataset | None:
         return None
     if not (folder / layout.INFO_FILE).is_file():
         raise ConflictError(
-            f"{folder}: exists and is no LeRobot data set; choose another folder (--force and "
+            f"{folder}: exists and is not a LeRobot data set; choose another folder (--force and "
             "--append leave it as it is)"
         )
     if options.existing == "refuse":
