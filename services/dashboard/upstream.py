@@ -12,7 +12,7 @@ import httpx
 from prometheus_client import Histogram
 from pydantic import SecretStr, TypeAdapter, ValidationError
 
-from dextouch.clients.http_link import service_address
+from dextouch.clients import service_address
 from dextouch.errors import InvalidInputError, NotFoundError, UnavailableError
 from dextouch.schemas import Problem, error_from_problem, first_problems
 from dextouch.tracing import trace_headers

@@ -6,6 +6,8 @@ import numpy as np
 from jaxtyping import Bool, Int64
 
 from dextouch.clocks import (
+    AHEAD_NS,
+    MIN_SAMPLES,
     corrected_stamps,
     count_lost_samples,
     date_by_counting,
@@ -14,7 +16,6 @@ from dextouch.clocks import (
     prefers_sequence,
     unwrap_counter,
 )
-from dextouch.clocks.clock_model import AHEAD_NS, MIN_SAMPLES
 from dextouch.errors import ClockFitError, InvalidInputError
 from dextouch.schemas import ClockMethod, ClockReport, ClockWarning
 from dextouch.streams import NO_DEVICE_TIME, NO_SEQUENCE, SampleBatch, StreamDescriptor

@@ -2,6 +2,7 @@ from . import gym_env as gym_env
 from .episode_store import EpisodeStoreClient as EpisodeStoreClient
 from .http_link import HttpLink as HttpLink
 from .http_link import Reply as Reply
+from .http_link import service_address as service_address
 from .openpi import OpenPiPolicy as OpenPiPolicy
 from .rollouts import Policy as Policy
 from .rollouts import PolicyStart as PolicyStart

@@ -1,3 +1,5 @@
+from .clock_model import AHEAD_NS as AHEAD_NS
+from .clock_model import MIN_SAMPLES as MIN_SAMPLES
 from .clock_model import ClockModel as ClockModel
 from .clock_model import ClockSegment as ClockSegment
 from .clock_model import corrected_stamps as corrected_stamps
