@@ -21,8 +21,13 @@ from dextouch.schemas import (
     start_of_parts,
     validate_fields,
 )
-from dextouch.serving import MAX_WEBSOCKET_BYTES, AccessControl, accept_messages_of, decoded
-from dextouch.serving.guard import close_reason
+from dextouch.serving import (
+    MAX_WEBSOCKET_BYTES,
+    AccessControl,
+    accept_messages_of,
+    close_reason,
+    decoded,
+)
 from dextouch.streams import pack_openpi, unpack, unpack_openpi
 from dextouch.worlds.records import Answer
 from dextouch.worlds.rollouts import RolloutService
