@@ -213,15 +213,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
                 {"family": family, "way": way, "read_bytes": size, "rounds": figure}
                 for (family, way, size), figure in speeds.items()
             ],
-            "drivers": [
-                {
-                    "driver": talk.name,
-                    "packet_bytes": talk.packet_bytes,
-                    "packet_reads": talk.packet_reads,
-                    "us_a_packet": driver_us[talk.name],
-                }
-                for talk in talks
-            ],
+            "drivers": [_row(talk, driver_us[talk.name]) for talk in talks],
             "eight_gloves": runs,
             "starved": [
                 {"load": load, "way": way, **found} for (load, way), found in starved.items()
@@ -233,3 +225,12 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
             "camera times include the quality checks; one in 10 JPEG images is decoded",
         ],
     )
+
+
+def _row(talk: DeviceTalk, us_a_packet: Figure) -> dict[str, object]:
+    return {
+        "driver": talk.name,
+        "packet_bytes": talk.packet_bytes,
+        "packet_reads": talk.packet_reads,
+        "us_a_packet": us_a_packet,
+    }

@@ -107,6 +107,13 @@ def _detected(
     return list(zip(numbers, pixels, strict=True))
 
 
+def gray_image(image: UInt8[np.ndarray, "h w *c"]) -> UInt8[np.ndarray, "h w"]:
+    """Luma of an RGB image; a gray one, with or without its channel, as it is."""
+    channels = image.reshape(*image.shape[:2], -1)
+    is_gray = channels.shape[2] == 1
+    return channels[..., 0] if is_gray else cv2.cvtColor(channels, cv2.COLOR_RGB2GRAY)
+
+
 class MarkerTracker:
     """Finds a task's objects in images of a camera; K in px, pixel centres at half-integers."""
 
@@ -131,9 +138,7 @@ class MarkerTracker:
         T_world_camera: Float64[np.ndarray, "4 4"],
     ) -> None:
         """Look for the objects in one more image; images come in the order of their times."""
-        gray = image.reshape(*image.shape[:2], -1)
-        gray = gray[..., 0] if gray.shape[2] == 1 else cv2.cvtColor(gray, cv2.COLOR_RGB2GRAY)
-        found = self._markers.find(gray)
+        found = self._markers.find(gray_image(image))
         for one in self._objects:
             candidates = list(self._candidates(one, found))
             if candidates:

@@ -23,6 +23,7 @@ from services.alignment.calibration.time_offset import (
     estimate_time_offset,
     low_passed,
 )
+from services.alignment.markers import gray_image
 
 # A loop of three offsets that misses zero by more standard deviations has a wrong one among them;
 # so has a pair whose offset in a part of the take is as far off.
@@ -131,8 +132,7 @@ def turning_of_images(
 
 def _small_gray(image: np.ndarray) -> tuple[UInt8[np.ndarray, "h w"], float]:
     """A gray image of at most `_MAX_WIDTH_PX`, and its width over that of the image."""
-    gray = image.reshape(*image.shape[:2], -1)
-    gray = gray[..., 0] if gray.shape[2] == 1 else cv2.cvtColor(gray, cv2.COLOR_RGB2GRAY)
+    gray = gray_image(image)
     scale = min(1.0, _MAX_WIDTH_PX / gray.shape[1])
     if scale < 1.0:
         gray = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
