@@ -30,7 +30,7 @@ from services.evaluation import command_line as evaluation
 from services.evaluation.matched_starts import start_digest
 from services.evaluation.policies.behaviour_cloning import action_weights, from_world, in_world
 from services.evaluation.policies.cloning_training import IMITATED
-from services.evaluation.settings import TrainPolicySettings, command_line
+from services.evaluation.settings import CloningSettings, TrainPolicySettings, command_line
 from services.evaluation.trained_networks import (
     Checkpoint,
     CheckpointMetadata,
@@ -370,9 +370,18 @@ def run_train_policy(arguments: list[str]) -> int:
     settings = load_settings(TrainPolicySettings, arguments)
     if settings.places is None:
         return evaluation.run_train_policy(arguments)
-    if settings.early_at is not None:
+    unused = [
+        flag
+        for flag, is_given in {
+            "--early-at": settings.early_at is not None,
+            "--training": settings.training != CloningSettings(),
+        }.items()
+        if is_given
+    ]
+    if unused:
         raise InvalidInputError(
-            "train policy --places: got --early-at, expected none: it is fitted in one go"
+            f"train policy --places: got {' and '.join(unused)}, expected neither: the policy is "
+            "fitted in one go, without training steps"
         )
     checkpoint = train_place_policy(
         read_demonstrations(settings),

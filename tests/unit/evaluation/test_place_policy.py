@@ -201,7 +201,8 @@ def test_what_it_cannot_do_is_refused(policy_file, model, store):
     with pytest.raises(UnknownNameError, match="task of the place policy"):
         read_places([], config, "reach", one.first, one.grid.anchor, one.grid.K_head)
     flags = ["--episodes", str(store.root), "--places", str(model), "--early-at", "0.5"]
-    with pytest.raises(InvalidInputError, match="got --early-at"):
+    flags += ["--training.batch-size", "8"]
+    with pytest.raises(InvalidInputError, match="got --early-at and --training,"):
         run_command(["train", "policy", *flags])
 
 

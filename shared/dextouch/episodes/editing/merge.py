@@ -112,6 +112,8 @@ class _Origins:
 
     def __init__(self, store: EpisodeStore) -> None:
         self._store = store
+        # Hashes of the contents that a dry run would have copied so far, by kind and id.
+        self.planned: dict[tuple[str, str], str] = {}
 
     @cached_property
     def _found(self) -> defaultdict[tuple[str, str], list[LineageEntry]]:
@@ -178,8 +180,7 @@ class _Merge:
                 f"{name!r}: it, its recording or its operator was permanently deleted from the "
                 f"target on {covered.deleted_at:%Y-%m-%d}"
             )
-        is_taken = target.exists(name, kind=kind)
-        ours = target.open_item(kind, name).content_sha256 if is_taken else None
+        ours = self._sha256_in_target(kind, name)
         remarks = self._remarks(kind, name)
         if ours == sha256:
             moved = self._add_remarks(kind, name, remarks)
@@ -195,25 +196,33 @@ class _Merge:
             reason = "deleted: it is in the trash" if made.operation else ""
             return MergeReport(kind, name, source.url, "there", made.id, reason=reason)
         new_id, attributes = name, reader.attributes
-        if is_taken:
+        if ours is not None:
             if not self.options.rename:
                 reason = f"{kind} {name!r} of the target has other content; --rename copies it too"
                 return MergeReport(kind, name, source.url, "refused", reason=reason)
             ids = numbered_ids(name, "merged")
-            new_id = next(one for one in ids if not target.exists(one, kind=kind))
+            new_id = next(one for one in ids if self._sha256_in_target(kind, one) is None)
             lineage = (*map(self._in_target, attributes.lineage), entry)
             changes = {f"{kind}_id": new_id, "lineage": lineage}
             attributes = attributes.model_copy(update=changes)
-        if not self.options.dry_run:
+        if self.options.dry_run:
+            self.origins.planned[kind, new_id] = sha256
+        else:
             reader.verify()
             copy_item(source, target, reader, attributes, remarks)
             copied = target.open_item(kind, new_id).content_sha256
             self._note_results(kind, new_id, copied, remarks)
-            if is_taken:
+            if ours is not None:
                 item = LineageEntry(kind=kind, id=new_id, sha256=copied)
                 self._rename(entry, item)
                 self.origins.add(entry, item)
         return MergeReport(kind, name, source.url, "copied", new_id)
+
+    def _sha256_in_target(self, kind: Kind, name: str) -> str | None:
+        """Hash of what the target has by this id, or would have after a dry run; None if free."""
+        if self.target.exists(name, kind=kind):
+            return self.target.open_item(kind, name).content_sha256
+        return self.origins.planned.get((kind, name))
 
     def _rename(self, before: LineageEntry, after: LineageEntry) -> None:
         self.renamed[before.kind, before.id] = before, after
@@ -272,6 +281,8 @@ class _Merge:
     ) -> tuple[str, ...]:
         """Give an item in the target the remarks that only its copy has; returns their names."""
         target = self.target
+        if (kind, name) in self.origins.planned:
+            return ()
         ours = {
             REVIEW_FILE: target.review(name, kind=kind),
             CLICKS_FILE: target.clicks(name) if kind == "episode" else None,
