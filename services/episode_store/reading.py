@@ -11,15 +11,7 @@ from fastapi import APIRouter, Header, Query, Response
 from jaxtyping import Float64
 from pydantic import AfterValidator, BaseModel, Field
 
-from dextouch.episodes import (
-    EpisodeReader,
-    EpisodeStore,
-    ImageForm,
-    RecordingReader,
-    encode_window,
-    interpolated_spans,
-    measured_taxels,
-)
+from dextouch import episodes
 from dextouch.errors import InvalidInputError, LimitExceededError
 from dextouch.frozen_model import FrozenModel
 from dextouch.hands.actions import ACTION_DIM, action_names, poses_from_actions
@@ -54,7 +46,7 @@ MAX_GAPS = 50
 MAX_IMAGES = 240
 QUALITY = 85
 TOUCH_STREAMS = tuple(f"tactile_{side}" for side in SIDES)
-Reader = EpisodeReader | RecordingReader
+Reader = episodes.EpisodeReader | episodes.RecordingReader
 # Limits of one request: signals, and bytes of samples that are read for it.
 MAX_SIGNALS = 16
 MAX_READ_BYTES = 256 * 2**20
@@ -92,7 +84,7 @@ class SpanQuery(FrozenModel):
 Span = Annotated[SpanQuery, Query()]
 
 
-def content_router(store: EpisodeStore, settings: EpisodeStoreSettings) -> APIRouter:
+def content_router(store: episodes.EpisodeStore, settings: EpisodeStoreSettings) -> APIRouter:
     """Create the routes of single recordings and episodes; sizes are checked before reading."""
     router = APIRouter(prefix="/v1", dependencies=[MAY_READ])
     max_steps, max_bytes = settings.max_window_steps, settings.max_answer_bytes
@@ -156,9 +148,9 @@ def response(
     return Response(read(), media_type=media_type, headers=headers)
 
 
-def _window(reader: EpisodeReader, query: WindowQuery, max_bytes: int) -> bytes:
+def _window(reader: episodes.EpisodeReader, query: WindowQuery, max_bytes: int) -> bytes:
     cameras = tuple(name for name in query.cameras.split(",") if name)
-    form = ImageForm(half_size=query.half_size, gray=query.gray)
+    form = episodes.ImageForm(half_size=query.half_size, gray=query.gray)
     # An unknown camera is refused by the reader.
     known_cameras = [reader.streams[name] for name in cameras if name in reader.streams]
     step_bytes = sum(
@@ -173,7 +165,7 @@ def _window(reader: EpisodeReader, query: WindowQuery, max_bytes: int) -> bytes:
     window = reader.window(
         query.start, query.num_steps, cameras=cameras, action_kind=query.action_kind, form=form
     )
-    return encode_window(window)
+    return episodes.encode_window(window)
 
 
 def _samples(reader: Reader, stream: str, span: SpanQuery, max_bytes: int) -> bytes:
@@ -216,7 +208,7 @@ class RobotHandsQuery(FrozenModel):
     action_kind: ActionKind = "measured"
 
 
-def robot_hands(reader: EpisodeReader, query: RobotHandsQuery) -> bytes:
+def robot_hands(reader: episodes.EpisodeReader, query: RobotHandsQuery) -> bytes:
     """Both robot hands of the actions in a span, by forward kinematics, as msgpack.
 
     Arrays: `t_ns` [n]; for each side `SIDE_points_world_m` [n, 5, 4, 3], knuckle, PIP, DIP and tip
@@ -244,12 +236,12 @@ def robot_hands(reader: EpisodeReader, query: RobotHandsQuery) -> bytes:
     return pack({"action_kind": query.action_kind}, _points(reader, read.t_ref_ns, read.values))
 
 
-def _is_of_human_hand(reader: EpisodeReader) -> bool:
+def _is_of_human_hand(reader: episodes.EpisodeReader) -> bool:
     return (reader.attributes.domain, reader.attributes.origin) == ("human", "twin")
 
 
 def _points(
-    reader: EpisodeReader, t_ref_ns: np.ndarray, actions: np.ndarray
+    reader: episodes.EpisodeReader, t_ref_ns: np.ndarray, actions: np.ndarray
 ) -> dict[str, np.ndarray]:
     arrays: dict[str, Any] = {"t_ns": t_ref_ns}
     if not len(t_ref_ns):
@@ -296,7 +288,7 @@ class SignalsQuery(FrozenModel):
 Signals = Annotated[SignalsQuery, Query()]
 
 
-def playback_router(store: EpisodeStore, settings: EpisodeStoreSettings) -> APIRouter:
+def playback_router(store: episodes.EpisodeStore, settings: EpisodeStoreSettings) -> APIRouter:
     """Create the routes below /v1/playback; sizes are checked before reading."""
     router = APIRouter(prefix="/v1/playback", dependencies=[MAY_READ], tags=["playback"])
 
@@ -345,7 +337,7 @@ def playback_of(reader: Reader) -> Playback:
     names = ("task", "instruction", "domain", "station", "operator", "success", "recovered")
     shared = {name: getattr(about, name) for name in (*names, "lineage")}
     span = {"start_ns": min(firsts, default=0), "stop_ns": max(lasts, default=0)}
-    if isinstance(reader, EpisodeReader):
+    if isinstance(reader, episodes.EpisodeReader):
         of_episode = reader.attributes
         origin_ns = of_episode.quality.get("origin_after_start_ns")
         own = {
@@ -367,15 +359,15 @@ def _played(reader: Reader, stream: StreamDescriptor) -> PlayedStream:
     gaps = np.flatnonzero(steps_ns > GAP_PERIODS * stream.period_ns())
     longest = np.sort(gaps[np.argsort(steps_ns[gaps], kind="stable")[-MAX_GAPS:]])
     calibration, num_taxels = reader.attributes.calibration, stream.tactile_layout.num_taxels
-    spans = interpolated_spans(calibration) if stream.name.startswith("action") else []
+    spans = episodes.interpolated_spans(calibration) if stream.name.startswith("action") else []
     taxels = np.zeros(0, dtype=np.int64)
     if stream.name in TOUCH_STREAMS:
-        measured = measured_taxels(calibration, num_taxels)
+        measured = episodes.measured_taxels(calibration, num_taxels)
         taxels = np.flatnonzero(~measured[TOUCH_STREAMS.index(stream.name)])
     is_action = stream.name in STREAMS.values() and stream.shape == (ACTION_DIM,)
     components = (
         action_names(has_robot_joints=not _is_of_human_hand(reader))
-        if is_action and isinstance(reader, EpisodeReader)
+        if is_action and isinstance(reader, episodes.EpisodeReader)
         else ()
     )
     return PlayedStream(
@@ -407,7 +399,7 @@ def _images(reader: Reader, camera: str, query: ImagesQuery, max_bytes: int) -> 
     if descriptor.kind != "image":
         raise InvalidInputError(f"images: {camera!r} is a stream of kind {descriptor.kind!r}")
     is_colour = len(descriptor.shape) == 3
-    form = ImageForm(half_size=query.half_size and is_colour)
+    form = episodes.ImageForm(half_size=query.half_size and is_colour)
     image_bytes = int(np.prod(form.shape(descriptor.shape)))
     allowed = max(1, min(MAX_IMAGES, max_bytes // image_bytes))
     text = f"the span holds {count} images, expected at most {allowed}; ask for a shorter time"
