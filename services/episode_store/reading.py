@@ -11,21 +11,12 @@ from fastapi import APIRouter, Header, Query, Response
 from jaxtyping import Float64
 from pydantic import AfterValidator, BaseModel, Field
 
-from dextouch import episodes
+from dextouch import episodes, schemas
 from dextouch.errors import InvalidInputError, LimitExceededError
 from dextouch.frozen_model import FrozenModel
 from dextouch.hands.actions import ACTION_DIM, action_names, poses_from_actions
 from dextouch.hands.robot_hand import RobotHand
 from dextouch.images import encode_jpeg
-from dextouch.schemas import (
-    ActionKind,
-    EpisodeDetail,
-    InterpolatedSpan,
-    ItemKind,
-    Playback,
-    PlayedStream,
-    RecordingAttributes,
-)
 from dextouch.serving import MSGPACK
 from dextouch.streams import JPEG_UNIT, StreamDescriptor, pack
 from dextouch.tactile.layout import SIDES
@@ -39,7 +30,7 @@ WINDOW_MSGPACK = "application/vnd.dextouch.window+msgpack"
 # Committed content is immutable but may be deleted: clients must revalidate.
 CACHE_CONTROL = "private, no-cache"
 IfNoneMatch = Annotated[str | None, Header(alias="if-none-match")]
-STREAMS: dict[ActionKind, str] = {"measured": "action", "commanded": "action_commanded"}
+STREAMS: dict[schemas.ActionKind, str] = {"measured": "action", "commanded": "action_commanded"}
 MAX_STEPS = 10_000
 GAP_PERIODS = 1.5
 MAX_GAPS = 50
@@ -69,7 +60,7 @@ class WindowQuery(FrozenModel):
     start: int = Field(ge=0)
     num_steps: int = Field(default=17, ge=1)
     cameras: str = "camera_head"
-    action_kind: ActionKind = "measured"
+    action_kind: schemas.ActionKind = "measured"
     half_size: bool = False
     gray: bool = False
 
@@ -90,7 +81,7 @@ def content_router(store: episodes.EpisodeStore, settings: EpisodeStoreSettings)
     max_steps, max_bytes = settings.max_window_steps, settings.max_answer_bytes
 
     @router.get("/recordings/{recording_id}/attributes", tags=["recordings"])
-    def get_recording_attributes(recording_id: str) -> RecordingAttributes:
+    def get_recording_attributes(recording_id: str) -> schemas.RecordingAttributes:
         """Attributes of a finished recording."""
         return store.recording(recording_id).attributes
 
@@ -106,10 +97,10 @@ def content_router(store: episodes.EpisodeStore, settings: EpisodeStoreSettings)
         return response(etag_of(reader, stream, span), known, read)
 
     @router.get("/episodes/{episode_id}", tags=["episodes"])
-    def get_episode(episode_id: str) -> EpisodeDetail:
+    def get_episode(episode_id: str) -> schemas.EpisodeDetail:
         """Attributes of an episode."""
         reader = store.open(episode_id)
-        return EpisodeDetail(
+        return schemas.EpisodeDetail(
             attributes=reader.attributes,
             num_steps=reader.num_steps,
             content_sha256=reader.content_sha256,
@@ -205,7 +196,7 @@ class RobotHandsQuery(FrozenModel):
 
     start_ns: int
     stop_ns: int
-    action_kind: ActionKind = "measured"
+    action_kind: schemas.ActionKind = "measured"
 
 
 def robot_hands(reader: episodes.EpisodeReader, query: RobotHandsQuery) -> bytes:
@@ -293,13 +284,13 @@ def playback_router(store: episodes.EpisodeStore, settings: EpisodeStoreSettings
     router = APIRouter(prefix="/v1/playback", dependencies=[MAY_READ], tags=["playback"])
 
     @router.get("/{kind}/{item_id}")
-    def get_playback(kind: ItemKind, item_id: str) -> Playback:
+    def get_playback(kind: schemas.ItemKind, item_id: str) -> schemas.Playback:
         """What can be played of an item: its streams with their extents and longest gaps."""
         return playback_of(store.open_item(kind, item_id))
 
     @router.get("/{kind}/{item_id}/images/{camera}", **_answers(MSGPACK))
     def get_playback_images(
-        kind: ItemKind, item_id: str, camera: str, query: Images, known: IfNoneMatch = None
+        kind: schemas.ItemKind, item_id: str, camera: str, query: Images, known: IfNoneMatch = None
     ) -> Response:
         """JPEG images of a span: arrays `t_ns`, `num_bytes` of each, and `data`, one by one."""
         reader = store.open_item(kind, item_id)
@@ -308,7 +299,7 @@ def playback_router(store: episodes.EpisodeStore, settings: EpisodeStoreSettings
 
     @router.get("/{kind}/{item_id}/signals", **_answers(MSGPACK))
     def get_playback_signals(
-        kind: ItemKind, item_id: str, query: Signals, known: IfNoneMatch = None
+        kind: schemas.ItemKind, item_id: str, query: Signals, known: IfNoneMatch = None
     ) -> Response:
         """Lowest and highest value per bin of time: arrays `NAME/low`, `NAME/high` [points]."""
         reader = store.open_item(kind, item_id)
@@ -328,7 +319,7 @@ def playback_router(store: episodes.EpisodeStore, settings: EpisodeStoreSettings
     return router
 
 
-def playback_of(reader: Reader) -> Playback:
+def playback_of(reader: Reader) -> schemas.Playback:
     """Facts about an item for a player; reads the stamps of every stream."""
     streams = tuple(_played(reader, stream) for stream in reader.streams.values())
     firsts = [stream.first_ns for stream in streams if stream.first_ns is not None]
@@ -350,10 +341,12 @@ def playback_of(reader: Reader) -> Playback:
     else:
         own = {"kind": "recording", "origin": "recorded", "at": reader.attributes.started_at}
         own["started_t_host_ns"] = reader.attributes.started_t_host_ns
-    return Playback.model_validate(shared | span | own | {"id": reader.item_id, "streams": streams})
+    return schemas.Playback.model_validate(
+        shared | span | own | {"id": reader.item_id, "streams": streams}
+    )
 
 
-def _played(reader: Reader, stream: StreamDescriptor) -> PlayedStream:
+def _played(reader: Reader, stream: StreamDescriptor) -> schemas.PlayedStream:
     stamps_ns = reader.stamps_ns(stream.name)
     steps_ns = np.diff(stamps_ns)
     gaps = np.flatnonzero(steps_ns > GAP_PERIODS * stream.period_ns())
@@ -370,7 +363,7 @@ def _played(reader: Reader, stream: StreamDescriptor) -> PlayedStream:
         if is_action and isinstance(reader, episodes.EpisodeReader)
         else ()
     )
-    return PlayedStream(
+    return schemas.PlayedStream(
         name=stream.name,
         kind=stream.kind,
         shape=stream.shape,
@@ -384,7 +377,7 @@ def _played(reader: Reader, stream: StreamDescriptor) -> PlayedStream:
         num_gaps=len(gaps),
         gaps_ns=tuple((int(stamps_ns[k]), int(stamps_ns[k + 1])) for k in longest),
         interpolated=tuple(
-            InterpolatedSpan(part=part, start_ns=start_ns, stop_ns=stop_ns)
+            schemas.InterpolatedSpan(part=part, start_ns=start_ns, stop_ns=stop_ns)
             for part, start_ns, stop_ns in spans
         ),
         unmeasured_taxels=tuple(taxels.tolist()),
