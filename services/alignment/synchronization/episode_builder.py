@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float64
 from dextouch.episodes import RecordingReader
 from dextouch.errors import InvalidInputError
 from dextouch.geometry import nearest_index
+from dextouch.hands.robot_hand import NUM_JOINTS
 from dextouch.schemas import (
     SHARED_ATTRIBUTES,
     Domain,
@@ -453,17 +454,21 @@ def _episode_attributes(
 def check_complete(recording: RecordingReader) -> None:
     """Refuse a recording without any hand or with wrong matrices; raises InvalidInputError."""
     where = f"recording {recording.attributes.recording_id!r}"
-    _check_hands(recording, recording.streams)
+    streams = recording.streams
+    _check_hands(recording, streams)
+    of_actions = (*ACTION_STREAMS[recording.attributes.domain], *commanded_streams(streams))
+    for name in ("joints_measured", "joints_commanded"):
+        if name in of_actions and name in streams and streams[name].shape != (NUM_JOINTS * 2,):
+            raise InvalidInputError(
+                f"{where}: stream {name!r} has samples of {streams[name].shape}, expected the "
+                f"{NUM_JOINTS * 2} joints of both hands in rad, left before right"
+            )
     # One window holds both hands.
     common_layout(
-        [
-            stream.tactile_layout
-            for name, stream in recording.streams.items()
-            if name in TOUCH_STREAMS
-        ],
+        [stream.tactile_layout for name, stream in streams.items() if name in TOUCH_STREAMS],
         what=where,
     )
-    for stream in recording.streams.values():
+    for stream in streams.values():
         check_lens(stream, recording.attributes.calibration, where=where)
 
 
