@@ -94,7 +94,11 @@ class BridgeHello(FrozenModel):
 
     @model_validator(mode="after")
     def _tells_devices_apart(self) -> "BridgeHello":
-        for name in ("index", "serial_number"):
+        names = ["index", "serial_number"]
+        if self.kind != "pose_tracker":
+            # Packets of poses alone carry the index: of others the source says whose they are.
+            names.append("source")
+        for name in names:
             values = [getattr(device, name) for device in self.devices]
             if len(set(values)) < len(values):
                 raise ValueError(f"devices: {name} {values} are not all different")
