@@ -186,6 +186,9 @@ class HandFollower:
         delay_s = self._ages.delay_s(sample.t_device_ns, t_s)
         if delay_s is None:
             self.refused["time"] += 1
+            if self._retargeter is None:
+                # It may be the one before that was wrong, such as an old one from a cache.
+                self._ages = _SampleAges()
         elif delay_s > self.limits.hold_after_s:
             self.refused["late"] += 1
         elif not np.isfinite(sample.keypoints_m).all(axis=1).any():
