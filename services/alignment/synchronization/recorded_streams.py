@@ -24,13 +24,13 @@ from dextouch.streams import (
     ENCODED_UNITS,
     H264_UNIT,
     HEAD_CAMERA,
+    MAX_MISSING,
     MOUNTS,
     Implausible,
     StreamDescriptor,
     check_camera_matrix,
     encoded_values,
 )
-from dextouch.streams.taxel_faults import MAX_MISSING
 from services.alignment.calibration.tactile_tare import (
     ABSENT,
     MAX_WRONG_TAXELS,
