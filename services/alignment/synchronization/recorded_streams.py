@@ -282,7 +282,7 @@ def _without_absent(stream: DatedStream) -> DatedStream:
     if not 0 < is_absent.mean() <= MAX_WRONG_TAXELS:
         return stream
     listed = _with_refused(stream, np.where(is_absent, ABSENT, OK))
-    return replace(listed, convert=partial(np.where, is_absent, np.float32(0.0)))
+    return replace(listed, convert=lambda kpa: np.where(is_absent, np.float32(0.0), kpa))
 
 
 def _with_refused(stream: DatedStream, refused: np.ndarray) -> DatedStream:
