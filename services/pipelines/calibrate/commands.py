@@ -199,8 +199,7 @@ def _from_taps(glove: TakeStream, tracker: TakeStream) -> TimeOffset:
             layout=stream.layout,
         )
         readings = known.to_kpa(readings)
-    pressure_kpa = readings.astype(np.float64)
-    whole = np.isfinite(pressure_kpa).all(axis=1)
     t_pose_ns, poses = tracker.poses()
-    peaks_kpa = pressure_kpa[whole].max(axis=1)
-    return estimate_tap_offset(t_ns[whole], peaks_kpa, t_pose_ns, poses[:, HEIGHT])
+    peaks_kpa = np.where(np.isfinite(readings), readings, -np.inf).max(axis=1).astype(np.float64)
+    seen = np.isfinite(peaks_kpa)
+    return estimate_tap_offset(t_ns[seen], peaks_kpa[seen], t_pose_ns, poses[:, HEIGHT])
