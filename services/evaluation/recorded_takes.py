@@ -37,7 +37,7 @@ from services.evaluation.policies.open_loop import ReplayPolicy
 from services.evaluation.progress import Progress
 from services.evaluation.rendering import rendered
 from services.evaluation.scores import ClosedLoopReport, Outcome, RolloutFailure, RolloutScore
-from services.evaluation.statistics import area_under_roc, central_interval
+from services.evaluation.statistics import area_interval, area_under_roc
 from services.evaluation.success_classifier import SuccessClassifier
 from services.networks.training_settings import USUAL_IMAGE_PX
 
@@ -46,7 +46,6 @@ IMAGINED: Final = "imagined"
 REPLAYED: Final = (needs.EVERY_PART, needs.WHOLE, needs.OUTCOME, needs.IMAGES)
 # Name of the replayed actions among the policies.
 REPLAY: Final = "recorded actions"
-_DRAWS: Final = 1000
 # With fewer takes of either outcome, an area under the curve says little.
 LEAST_OF_EACH: Final = 5
 
@@ -131,8 +130,8 @@ class RecordedScores:
     def trust(self, task: str) -> dict[str, Any]:
         """How imagined verdicts of the recorded actions compare with their real outcomes.
 
-        `auc` is that of the probability of success, undecided rollouts included, with a bootstrap
-        interval over the takes; `wrong` is the share of wrong verdicts among the decided.
+        `auc` is that of the probability of success, undecided rollouts included, with its 95 %
+        interval (`area_interval`); `wrong` is the share of wrong verdicts among the decided.
         """
         scores = self.scores(REPLAY, task)
         real = np.array([self.takes[one.seed].success for one in scores])
@@ -148,7 +147,8 @@ class RecordedScores:
         if min(real.sum(), (~real).sum()) >= LEAST_OF_EACH:
             probability = np.array([one.probability for one in scores])
             figures["auc"] = area_under_roc(probability, real)
-            figures["auc_interval"] = _auc_interval(probability, real)
+            interval = area_interval(figures["auc"], real.sum(), (~real).sum())
+            figures["auc_interval"] = [interval.low, interval.high]
         return figures
 
     def policy_row(self, policy: str, task: str) -> dict[str, Any]:
@@ -239,20 +239,6 @@ def _digests(start: MatchedStart) -> tuple[str, ...]:
     images = start.observation.images[HEAD_CAMERA]
     small = square_of_at_most(images, start.K_head, USUAL_IMAGE_PX)[0][0]
     return start.digest, start_digest(small, np.maximum(touch, 0.0))
-
-
-def _auc_interval(probability: np.ndarray, real: np.ndarray) -> list[float]:
-    """95 % bootstrap interval, with as many takes of each outcome in every draw."""
-    draw = np.random.default_rng(0)
-    good, bad = probability[real], probability[~real]
-    outcome = np.repeat([True, False], [len(good), len(bad)])
-    areas = [
-        area_under_roc(np.concatenate([draw.choice(good, len(good)), draw.choice(bad, len(bad))]),
-                       outcome)
-        for _ in range(_DRAWS)
-    ]  # fmt: skip
-    interval = central_interval(np.array(areas))
-    return [interval.low, interval.high]
 
 
 def score_lines(scores: RecordedScores) -> list[str]:
