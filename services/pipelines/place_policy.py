@@ -34,7 +34,6 @@ from services.evaluation.settings import TrainPolicySettings, command_line
 from services.evaluation.trained_networks import (
     Checkpoint,
     CheckpointMetadata,
-    load_checkpoint,
 )
 from services.networks.weight_files import load_strictly
 from services.world_model.checkpoints import read_state_checkpoint
@@ -230,11 +229,6 @@ class PlacePolicy:
     def tasks(self) -> tuple[str, ...]:
         """The tasks it has demonstrations of."""
         return self.metadata.tasks
-
-    @classmethod
-    def load(cls, path: Path) -> "PlacePolicy":
-        """Load a policy from its file."""
-        return cls(load_checkpoint(path, kind=KIND))
 
     def reset(self, start: PolicyStart) -> None:
         """Start a new rollout; raises UnknownNameError for a task without demonstrations."""

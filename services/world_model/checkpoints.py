@@ -128,13 +128,6 @@ def dropout_shares(text: float, action: float, ancestor: Checkpoint | None) -> t
     return text, action
 
 
-def view_dropout(share: float, network: NetworkConfig, before: CheckpointMetadata | None) -> float:
-    """Share of windows without a further view for the metadata, as `dropout_shares`."""
-    if not network.further_views:
-        return 0.0
-    return share or (before.view_dropout if before else 0.0)
-
-
 def write_checkpoint(path: Path, model: JointWorldModel, metadata: CheckpointMetadata) -> str:
     """Write the file atomically and return its digest; the full size with its text features."""
     if model.text_features is None:

@@ -451,6 +451,7 @@ def _metadata(
     names = {episode.episode_id for episode in trained}
     windows = settings.windows
     dropped = checkpoints.dropout_shares(windows.text_dropout, windows.action_dropout, ancestor)
+    of_views = windows.view_dropout or (before.view_dropout if before else 0.0)
     return checkpoints.CheckpointMetadata(
         name=settings.name,
         network=network,
@@ -478,7 +479,7 @@ def _metadata(
         tokenizer_digest=before.tokenizer_digest if before else None,
         text_dropout=dropped[0],
         action_dropout=dropped[1],
-        view_dropout=checkpoints.view_dropout(windows.view_dropout, network, before),
+        view_dropout=of_views if network.further_views else 0.0,
     )
 
 

@@ -35,7 +35,7 @@ from services.world_model.settings import CoreSettings, ReaderSettings
 from services.world_model.training.scene_table import MEASURED_ERROR_M, SceneTable
 
 # Metres that count as one in the errors of positions.
-UNIT_M = 0.05
+_UNIT_M = 0.05
 _BATCH_OF_READING = 128
 _WEIGHT_DECAY = 1e-3
 _SD_WEIGHT = 0.02
@@ -167,7 +167,7 @@ def _error(
     """Errors of objects that are `there`, and of the presence of the slots that are `used`."""
     predicted = reading.objects
     position = functional.smooth_l1_loss(
-        predicted.position_m / UNIT_M, true.position_m / UNIT_M, beta=0.1, reduction="none"
+        predicted.position_m / _UNIT_M, true.position_m / _UNIT_M, beta=0.1, reduction="none"
     ).sum(-1)
     axes = (predicted.axes - true.axes).square().sum((-1, -2))
     presence = functional.binary_cross_entropy(
@@ -513,7 +513,7 @@ def _object_error(
     """Errors of positions (twice) and axes of objects present now, known, and seen at the start."""
     weight = true.present * (known > 0.5)
     position = functional.smooth_l1_loss(
-        predicted.position_m / UNIT_M, true.position_m / UNIT_M, beta=0.2, reduction="none"
+        predicted.position_m / _UNIT_M, true.position_m / _UNIT_M, beta=0.2, reduction="none"
     ).sum(-1)
     axes = (predicted.axes - true.axes).square().sum((-1, -2))
     return ((2.0 * position + axes) * weight).sum() / weight.sum().clamp_min(1.0)
