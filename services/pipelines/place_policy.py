@@ -14,13 +14,7 @@ import torch
 from jaxtyping import Float64
 
 from dextouch.clients import PolicyStart
-from dextouch.episodes import (
-    EpisodeGrid,
-    EpisodeReader,
-    EpisodeStore,
-    data_hash,
-    select_episodes,
-)
+from dextouch.episodes import EpisodeGrid, EpisodeReader, EpisodeStore, data_hash, select_episodes
 from dextouch.errors import InvalidInputError, UnknownNameError
 from dextouch.hands.actions import ACTION_DIM, AnchorPoses
 from dextouch.schemas import CHUNK_STEPS, Observation, Origin
@@ -31,10 +25,7 @@ from services.evaluation.matched_starts import start_digest
 from services.evaluation.policies.behaviour_cloning import action_weights, from_world, in_world
 from services.evaluation.policies.cloning_training import IMITATED
 from services.evaluation.settings import TrainPolicySettings, command_line
-from services.evaluation.trained_networks import (
-    Checkpoint,
-    CheckpointMetadata,
-)
+from services.evaluation.trained_networks import Checkpoint, CheckpointMetadata
 from services.networks.weight_files import load_strictly
 from services.world_model.checkpoints import read_state_checkpoint
 from services.world_model.dynamics.features import DynamicsConfig, hand_motion
@@ -369,8 +360,6 @@ def run_train_policy(arguments: list[str]) -> int:
             "train policy --places: got --early-at, expected none: it is fitted in one go"
         )
     checkpoint = train_place_policy(
-        read_demonstrations(settings),
-        settings.places,
-        command=command_line("policy", arguments),
+        read_demonstrations(settings), settings.places, command=command_line("policy", arguments)
     )
     return evaluation.keep(checkpoint, settings.output, settings.json_path)

@@ -31,11 +31,7 @@ from services.networks.weight_files import (
 )
 from services.world_model.dynamics.features import DynamicsConfig
 from services.world_model.dynamics.model import DynamicsModel
-from services.world_model.network.configuration import (
-    NetworkConfig,
-    RendererConfig,
-    TokenizerName,
-)
+from services.world_model.network.configuration import NetworkConfig, RendererConfig, TokenizerName
 from services.world_model.network.model import JointWorldModel
 from services.world_model.network.tactile import TactileTokenizer, build_tokenizer
 from services.world_model.rendering.renderer import RendererNetwork

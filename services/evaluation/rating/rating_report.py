@@ -111,9 +111,7 @@ def intraclass_correlation(ratings: Float64[np.ndarray, "_ _"]) -> float:
 
 
 def rater_biases(
-    raters: Sequence[str],
-    ratings: Float64[np.ndarray, "_ _"],
-    generator: np.random.Generator,
+    raters: Sequence[str], ratings: Float64[np.ndarray, "_ _"], generator: np.random.Generator
 ) -> list[RaterBias]:
     """Bias of each rater who shares two rollouts with others, with a bootstrap over rollouts."""
     known = np.isfinite(ratings)

@@ -134,9 +134,6 @@ class HandFollower:
         self._upper_rad = self.hand.upper_rad - limits.margin_rad
         self._relaxed_rad = np.clip(0.0, self._lower_rad, self._upper_rad)
         self._gaps = FingerGaps(self.hand, np.array(shape.shape.radii_m))
-        self._finger_of_joint = np.repeat(
-            np.arange(len(self.hand.fingers)), [len(finger.joints) for finger in self.hand.fingers]
-        )
         self.start(self._relaxed_rad)
 
     def start(self, joints_rad: np.ndarray) -> None:
@@ -276,18 +273,14 @@ class HandFollower:
         if not result.solved[0].any():
             self.refused["implausible"] += 1
             return None
-        is_new = result.solved[0][self._finger_of_joint]
+        is_new = result.solved[0][self._gaps.finger_of_joint]
         self._target_rad = np.where(is_new, result.joints_rad[0], self._target_rad)
         self._tip_error_m = result.tip_error_m[0]
         self._followed, self._fresh_s = sample, fresh_s
         return received_s
 
     def _described(
-        self,
-        status: FollowerStatus,
-        age_s: float,
-        received_s: float | None,
-        is_stopped: np.ndarray,
+        self, status: FollowerStatus, age_s: float, received_s: float | None, is_stopped: np.ndarray
     ) -> Command:
         joints = self._joints_rad
         to_limit_rad = np.minimum(joints - self._lower_rad, self._upper_rad - joints)

@@ -12,12 +12,7 @@ from dextouch.errors import InvalidInputError, NonFiniteError
 from dextouch.schemas import MAX_OBJECTS
 from dextouch.tactile import CONTACT_THRESHOLD_KPA
 from dextouch.tactile.layout import DEXTOUCH_V1, TactileLayout
-from services.world_model.dynamics.core import (
-    NUM_PADS,
-    CoreState,
-    RecurrentCore,
-    SceneStart,
-)
+from services.world_model.dynamics.core import NUM_PADS, CoreState, RecurrentCore, SceneStart
 from services.world_model.dynamics.features import (
     FREE_KPA,
     NUM_POINTS,

@@ -120,9 +120,7 @@ class ViewTokens(nn.Module):
         self.past = nn.Parameter(0.02 * torch.randn(config.past_images, 1, 1, width))
 
     def forward(
-        self,
-        tokens: Float[Tensor, "batch tokens width"],
-        missing: Bool[Tensor, "batch further"],
+        self, tokens: Float[Tensor, "batch tokens width"], missing: Bool[Tensor, "batch further"]
     ) -> Float[Tensor, "batch tokens width"]:
         """Tokens, frame by frame and view by view, with their embeddings."""
         grid = split_axis(tokens, 1, (-1, 1 + len(self.views), self.num_places))
