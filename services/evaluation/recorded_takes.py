@@ -24,15 +24,8 @@ from dextouch.errors import InvalidInputError
 from dextouch.images import square_of_at_most
 from dextouch.schemas import WorldDescription
 from dextouch.streams import HEAD_CAMERA
+from services.evaluation import matched_starts
 from services.evaluation.closed_loop import RolloutRunner
-from services.evaluation.matched_starts import (
-    MatchedStart,
-    StudyWorlds,
-    WorldAddress,
-    check_judged_touch,
-    refuse_training_starts,
-    start_digest,
-)
 from services.evaluation.policies.open_loop import ReplayPolicy
 from services.evaluation.progress import Progress
 from services.evaluation.rendering import rendered
@@ -55,7 +48,7 @@ class RecordedTake:
     """A take of known outcome: its first observation, and the actions of its later steps."""
 
     episode_id: str
-    start: MatchedStart
+    start: matched_starts.MatchedStart
     success: bool
     actions: Float64[np.ndarray, "steps 67"]
     model_rate_hz: float
@@ -89,7 +82,7 @@ def read_takes(
 
 def _read_take(reader: EpisodeReader, number: int, further_views: Sequence[str]) -> RecordedTake:
     grid, about = EpisodeGrid(reader), reader.attributes
-    start = MatchedStart(
+    start = matched_starts.MatchedStart(
         about.task,
         number,
         about.instruction,
@@ -177,7 +170,7 @@ class RecordedScores:
 def score_recorded(
     takes: Sequence[RecordedTake],
     policies: Mapping[str, Policy],
-    world: WorldAddress,
+    world: matched_starts.WorldAddress,
     description: WorldDescription,
     probe: SuccessClassifier,
     *,
@@ -194,8 +187,8 @@ def score_recorded(
     digests = [digest for take in takes for digest in _digests(take.start)]
     judged = {"the success classifier": probe.metadata.training_starts}
     for what, trained in {**judged, **(trained_on or {})}.items():
-        refuse_training_starts(digests, trained_on=trained, what=what)
-    check_judged_touch({description.name: description})
+        matched_starts.refuse_training_starts(digests, trained_on=trained, what=what)
+    matched_starts.check_judged_touch({description.name: description})
     multiple = description.chunk_multiple
     for take in takes:
         description.check_rate(take.model_rate_hz, of=f"take {take.episode_id!r}")
@@ -220,7 +213,7 @@ def score_recorded(
         )
     replay = ReplayPolicy({(take.start.task, take.start.seed): take.actions for take in takes})
     actors: dict[str, Policy] = {REPLAY: replay, **policies}
-    worlds = StudyWorlds({IMAGINED: world}, {IMAGINED: description})
+    worlds = matched_starts.StudyWorlds({IMAGINED: world}, {IMAGINED: description})
     outcomes: list[Outcome] = []
     with Progress("imagined rollouts", len(takes) * len(actors)) as progress:
         for take in takes:
@@ -233,12 +226,12 @@ def score_recorded(
     return RecordedScores(tuple(takes), tuple(outcomes), tuple(policies))
 
 
-def _digests(start: MatchedStart) -> tuple[str, ...]:
+def _digests(start: matched_starts.MatchedStart) -> tuple[str, ...]:
     """Digests of a start: as recorded, and with the image and touch that worlds make of it."""
     touch = start.observation.tactile_kpa[0]
     images = start.observation.images[HEAD_CAMERA]
     small = square_of_at_most(images, start.K_head, USUAL_IMAGE_PX)[0][0]
-    return start.digest, start_digest(small, np.maximum(touch, 0.0))
+    return start.digest, matched_starts.start_digest(small, np.maximum(touch, 0.0))
 
 
 def score_lines(scores: RecordedScores) -> list[str]:

@@ -14,13 +14,7 @@ import torch
 from jaxtyping import Float64
 
 from dextouch.clients import PolicyStart
-from dextouch.episodes import (
-    EpisodeGrid,
-    EpisodeReader,
-    EpisodeStore,
-    data_hash,
-    select_episodes,
-)
+from dextouch.episodes import EpisodeGrid, EpisodeReader, EpisodeStore, data_hash, select_episodes
 from dextouch.errors import InvalidInputError, UnknownNameError
 from dextouch.hands.actions import ACTION_DIM, AnchorPoses
 from dextouch.schemas import CHUNK_STEPS, Observation, Origin
@@ -31,11 +25,7 @@ from services.evaluation.matched_starts import start_digest
 from services.evaluation.policies.behaviour_cloning import action_weights, from_world, in_world
 from services.evaluation.policies.cloning_training import IMITATED
 from services.evaluation.settings import CloningSettings, TrainPolicySettings, command_line
-from services.evaluation.trained_networks import (
-    Checkpoint,
-    CheckpointMetadata,
-    load_checkpoint,
-)
+from services.evaluation.trained_networks import Checkpoint, CheckpointMetadata
 from services.networks.weight_files import load_strictly
 from services.world_model.checkpoints import read_state_checkpoint
 from services.world_model.dynamics.features import DynamicsConfig, hand_motion
@@ -231,11 +221,6 @@ class PlacePolicy:
         """The tasks it has demonstrations of."""
         return self.metadata.tasks
 
-    @classmethod
-    def load(cls, path: Path) -> "PlacePolicy":
-        """Load a policy from its file."""
-        return cls(load_checkpoint(path, kind=KIND))
-
     def reset(self, start: PolicyStart) -> None:
         """Start a new rollout; raises UnknownNameError for a task without demonstrations."""
         if start.task not in self._motions:
@@ -384,8 +369,6 @@ def run_train_policy(arguments: list[str]) -> int:
             "fitted in one go, without training steps"
         )
     checkpoint = train_place_policy(
-        read_demonstrations(settings),
-        settings.places,
-        command=command_line("policy", arguments),
+        read_demonstrations(settings), settings.places, command=command_line("policy", arguments)
     )
     return evaluation.keep(checkpoint, settings.output, settings.json_path)

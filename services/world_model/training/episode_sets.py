@@ -133,10 +133,7 @@ def load_split(
     people: list[TrainingEpisode] = []
     for url in settings.human if settings.human_episodes != 0 else ():
         people += read(url, domain="human")
-    together = [
-        *trained,
-        *subset_by_hash(people, settings.human_episodes, what="human"),
-    ]
+    together = [*trained, *subset_by_hash(people, settings.human_episodes, what="human")]
     rates_hz = {episode.model_rate_hz for episode in (*together, *heldout)}
     ids = [episode.episode_id for episode in together]
     check_stores([settings.episodes, *settings.human], ids, rates_hz)

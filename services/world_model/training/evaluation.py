@@ -15,13 +15,14 @@ from dextouch.metrics import image as image_metrics
 from dextouch.metrics import tactile as tactile_metrics
 from dextouch.schemas import CHUNK_STEPS, ActionKind
 from dextouch.tactile.layout import DEXTOUCH_V1, TactileLayout
+from services.world_model.checkpoints import StateBounds
 from services.world_model.dynamics.features import STEPS_PER_LATENT
 from services.world_model.dynamics.model import DynamicsModel, ImaginedSteps, batched
 from services.world_model.network.codecs import to_uint8, to_unit
 from services.world_model.network.inputs import PredictionRequest, build_inputs
 from services.world_model.network.model import JointWorldModel, stack_noise
 from services.world_model.training import joint_dataset
-from services.world_model.training.reader_training import reader_errors
+from services.world_model.training.member_training import reader_errors
 from services.world_model.training.scene_table import SceneTable
 
 BATCH = 24
@@ -216,22 +217,15 @@ def _figures(predicted: Futures, true: Futures, suffix: str) -> dict[str, float]
     }
 
 
-@dataclass(frozen=True)
-class StateFigures:
-    """Measured accuracy, with the bounds that almost no held-out chunk exceeds.
+def evaluate_dynamics(
+    dynamics: DynamicsModel, table: SceneTable
+) -> tuple[dict[str, float], StateBounds]:
+    """Predict every episode from its first step and from later ones, and compare.
 
-    `figures` hold errors of readers (first member) and objects (median at a chunk's end) in mm, and
-    contact F1 and error of touch by chunks of 16 steps. Names with `from_16` are of starts at step
-    16.
+    Returns errors of readers (first member) and objects (median at a chunk's end) in mm, contact F1
+    and error of touch by chunks of 16 steps (names with `from_16` are of starts at step 16), and
+    the bounds that almost no held-out chunk exceeds.
     """
-
-    figures: dict[str, float]
-    disagreement_m: float
-    distance: float
-
-
-def evaluate_dynamics(dynamics: DynamicsModel, table: SceneTable) -> StateFigures:
-    """Predict every episode from its first step and from later ones, and compare."""
     figures: dict[str, float] = {}
     disagreement_m, distance = [], []
     if int(table.length.max()) <= CHUNK_STEPS:
@@ -248,10 +242,11 @@ def evaluate_dynamics(dynamics: DynamicsModel, table: SceneTable) -> StateFigure
         within = table.within(torch.arange(len(table)), start)
         disagreement_m.append(chunk_peaks(imagined.disagreement_m, within))
         distance.append(chunk_peaks(imagined.distance, within))
-    return StateFigures(
-        {name: round(float(value), 4) for name, value in figures.items()},
+    rounded = {name: round(float(value), 4) for name, value in figures.items()}
+    return rounded, StateBounds(
         disagreement_m=float(torch.cat(disagreement_m).quantile(_BOUND_QUANTILE)),
         distance=max(_SMALLEST_DISTANCE, float(torch.cat(distance).quantile(_BOUND_QUANTILE))),
+        of_chunks=True,
     )
 
 

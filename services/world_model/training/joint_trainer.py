@@ -33,15 +33,9 @@ from services.world_model.pretrained_video import (
     is_pretrained,
     share_texts,
 )
-from services.world_model.training import episode_sets, joint_dataset, resume_files
+from services.world_model.training import episode_sets, joint_dataset, joint_objective, resume_files
 from services.world_model.training.distribution import ALONE, Processes, load_whole, whole_weights
 from services.world_model.training.evaluation import evaluate_prediction, refuse_trained
-from services.world_model.training.joint_objective import (
-    LossOptions,
-    errors,
-    examples_of,
-    own_context,
-)
 from services.world_model.training.latent_cache import use_latent_cache
 from services.world_model.training.tokenizer_trainer import check_unseen, with_tokenizer
 
@@ -264,11 +258,11 @@ class TrainingRun:
         """One optimizer step; returns the video and tactile losses."""
         settings, num_parts = self.settings.optimizer, self.settings.accumulate
         if self.settings.self_forcing:
-            batch = own_context(
+            batch = joint_objective.own_context(
                 self.model, batch, generator=self._generator, processes=self.processes
             )
         windows = self.settings.windows
-        options = LossOptions(
+        options = joint_objective.LossOptions(
             windows.context_noise,
             settings.touch_loss,
             settings.precision,
@@ -277,7 +271,7 @@ class TrainingRun:
             text_dropout=windows.text_dropout,
             action_dropout=windows.action_dropout,
         )
-        examples = examples_of(
+        examples = joint_objective.examples_of(
             self.model,
             batch,
             generator=self._generator,
@@ -288,7 +282,7 @@ class TrainingRun:
         self.loop.optimizer.zero_grad()
         both = torch.zeros(2, device=examples.t.device)
         for part in examples.parts(num_parts):
-            loss = errors(self.model, part, settings.precision)
+            loss = joint_objective.errors(self.model, part, settings.precision)
             torch.autograd.backward(loss.video + settings.tactile_weight * loss.tactile)
             both += torch.stack([loss.video, loss.tactile]).detach()
         self.loop.step(video=both[0], touch=both[1])
@@ -451,6 +445,7 @@ def _metadata(
     names = {episode.episode_id for episode in trained}
     windows = settings.windows
     dropped = checkpoints.dropout_shares(windows.text_dropout, windows.action_dropout, ancestor)
+    of_views = windows.view_dropout or (before.view_dropout if before else 0.0)
     return checkpoints.CheckpointMetadata(
         name=settings.name,
         network=network,
@@ -478,7 +473,7 @@ def _metadata(
         tokenizer_digest=before.tokenizer_digest if before else None,
         text_dropout=dropped[0],
         action_dropout=dropped[1],
-        view_dropout=checkpoints.view_dropout(windows.view_dropout, network, before),
+        view_dropout=of_views if network.further_views else 0.0,
     )
 
 

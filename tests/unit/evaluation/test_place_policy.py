@@ -11,7 +11,7 @@ from dextouch.episodes import EpisodeStore
 from dextouch.errors import InvalidInputError, UnknownNameError
 from dextouch.hands.actions import IDENTITY_POSE_9D, POSE_SLICES
 from services.cli.main import run_command
-from services.evaluation.bundled_policies import bundled_policy
+from services.evaluation.bundled_policies import bundled_policy, trained_policy
 from services.evaluation.policies.behaviour_cloning import action_weights
 from services.evaluation.trained_networks import load_checkpoint
 from services.pipelines.place_policy import (
@@ -168,7 +168,7 @@ def test_the_file_is_loaded_as_any_trained_policy(policy_file, store):
 
 
 def test_chunks_are_those_of_one_motion_and_the_end_is_held(policy_file, store):
-    policy = PlacePolicy.load(policy_file)
+    policy = trained_policy(policy_file)
     one = started(policy, store.open(store.list()[0]))
     first = policy.act(one.first)
     assert first.shape == (16, 67)
@@ -182,7 +182,7 @@ def test_chunks_are_those_of_one_motion_and_the_end_is_held(policy_file, store):
 
 
 def test_what_it_cannot_do_is_refused(policy_file, model, store):
-    policy = PlacePolicy.load(policy_file)
+    policy = trained_policy(policy_file)
     reader = store.open(store.list()[0])
     one = Demonstration.of(reader, PX)
     with pytest.raises(InvalidInputError, match="act before reset"):

@@ -20,8 +20,13 @@ from services.world_model.checkpoints import read_state_checkpoint, write_state_
 from services.world_model.dynamics.features import TouchCodec
 from services.world_model.settings import CoreSettings, ReaderSettings, StateTrainSettings
 from services.world_model.training import state_data
-from services.world_model.training.core_training import CoreData, _read_start, start_steps
-from services.world_model.training.reader_training import read_step, train_reader
+from services.world_model.training.member_training import (
+    CoreData,
+    _read_start,
+    read_step,
+    start_steps,
+    train_reader,
+)
 from services.world_model.training.scene_table import SceneTable, scene_table
 from services.world_model.training.state_data import (
     check_drawable,
