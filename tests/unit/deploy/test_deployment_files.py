@@ -318,6 +318,21 @@ def test_a_station_reports_to_systemd_that_it_works():
     assert find_command(command.split())[0] == "station serve"
 
 
+def test_a_station_writes_only_where_its_unit_lets_it():
+    unit = (ROOT / "deploy/systemd/dextouch-station@.service").read_text()
+    (folder,) = re.findall(r"^StateDirectory=(.+)$", unit, re.M)
+    own = f"/var/lib/{folder.replace('%i', 'desk_3')}"
+    guide = (ROOT / "docs/stations.md").read_text()
+    settings = guide[guide.index("# /etc/dextouch/desk_3.env") :].partition("```")[0]
+    places = re.findall(r"^DEXTOUCH_\w+=(/var/lib/.+)$", settings, re.M)
+    assert all(place.startswith(f"{own}/") for place in places), places
+    # Compiled code is kept, too; otherwise every start compiles.
+    for name in ("station@", "alignment"):
+        unit = (ROOT / f"deploy/systemd/dextouch-{name}.service").read_text()
+        (folder,) = re.findall(r"^CacheDirectory=(.+)$", unit, re.M)
+        assert f"\nEnvironment=NUMBA_CACHE_DIR=/var/cache/{folder}\n" in unit
+
+
 SERVED = {
     "store": "store serve",
     "alignment": "align serve",
