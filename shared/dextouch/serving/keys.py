@@ -111,7 +111,10 @@ def not_signed_in() -> AccessDeniedError:
 def no_key(authorization: str | None) -> AccessDeniedError:
     """Error for a request with an unknown key, or with none."""
     if presented_key(authorization) is not None:
-        return AccessDeniedError("unknown key", reason="unknown_key")
+        return AccessDeniedError(
+            "unknown key: expected one of this service's api_keys, or of an enrolled station",
+            reason="unknown_key",
+        )
     return AccessDeniedError(
         "no key: expected the header 'Authorization: Bearer KEY'", reason="missing_key"
     )
