@@ -85,7 +85,7 @@ def create_rating_app(settings: RatingSettings) -> FastAPI:
     tasks = settings.tasks or tuple(rubrics)
     for task in tasks:
         rubric_of(task, rubrics)
-    store = EpisodeStore(settings.store_url)
+    store = EpisodeStore(settings.store_url).require_folder()
     marks = MarkLog(settings.marks)
     rollouts = rated_rollouts(store, tasks, study=settings.study)
     queue = RatingQueue(
