@@ -269,6 +269,15 @@ def test_container_and_unit_let_in_the_same_devices():
     assert numbers == set(majors.values())
 
 
+def test_a_container_with_devices_is_no_mock_and_says_which_devices():
+    services = yaml.safe_load((ROOT / "deploy/compose.devices.yml").read_text())["services"]
+    given = services["acquisition"]["environment"]
+    assert given["DEXTOUCH_ACQUISITION_MOCK"] == "false"
+    assert VARIABLE.fullmatch(given["DEXTOUCH_ACQUISITION_DEVICES"])[2] == "?"
+    fields = {name.removeprefix("DEXTOUCH_ACQUISITION_").lower() for name in given}
+    assert fields <= set(AcquisitionSettings.model_fields)
+
+
 def test_prometheus_scrapes_every_service():
     config = yaml.safe_load((ROOT / "deploy/prometheus/prometheus.yml").read_text())
     (job,) = config["scrape_configs"]
