@@ -18,9 +18,7 @@ def report_main(argv: Sequence[str]) -> int:
     """Print scores and agreement by task, and write the report on request."""
     settings = load_settings(RatingReportSettings, list(argv))
     if not settings.marks.is_file():
-        raise NotFoundError(
-            f"marks {settings.marks}: no such file; name that of `dextouch rate serve` by --marks"
-        )
+        raise NotFoundError(f"marks {settings.marks}: no such file; name that of `rate serve`")
     rubrics = read_rubrics(settings.rubrics)
     store = EpisodeStore(settings.store_url).require_folder()
     rollouts = rated_rollouts(store, tuple(rubrics), study=settings.study)
