@@ -80,7 +80,7 @@ def create_rating_app(settings: RatingSettings) -> FastAPI:
     tasks = settings.tasks or tuple(rubrics)
     for task in tasks:
         rubric_of(task, rubrics)
-    store = EpisodeStore(settings.store_url)
+    store = EpisodeStore(settings.store_url).require_folder()
     marks = MarkLog(settings.marks)
     rollouts = rating_queue.rated_rollouts(store, tasks, study=settings.study)
     queue = rating_queue.RatingQueue(

@@ -274,7 +274,10 @@ class EpisodeStoreClient:
 
 def _refusal(response: httpx.Response) -> DexTouchError:
     try:
-        return schemas.error_from_problem(schemas.Problem.model_validate_json(response.content))
+        where = f"{response.request.method} {response.request.url.copy_with(query=None)}"
+        return schemas.error_from_problem(
+            schemas.Problem.model_validate_json(response.content), where
+        )
     except ValidationError:
         # A proxy in between may send Retry-After, too.
         seconds = response.headers.get("retry-after", "")
