@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from dextouch.command_line import ProgressLines
@@ -88,7 +88,6 @@ def train_state(settings: StateTrainSettings) -> StateReport:
         settings = _with_base(base, config, settings)
         config = base.configured(config, keeps_tasks=settings.learn == "success")
     parts = settings.output.with_suffix(".parts")
-    parts.mkdir(parents=True, exist_ok=True)
     hashed = data_hash((e.content_sha256 for e in training), image_px=_unusual_px(settings))
     # Before training, so that invalid episodes are found at once.
     heldout_table, labelled = (
@@ -104,7 +103,7 @@ def train_state(settings: StateTrainSettings) -> StateReport:
     reads_starts = settings.labelled_share < 1 or not is_known or bool(table.touched.any())
     table_file = parts / "table.safetensors"
     codec_tensors = {f"codec/{name}": value for name, value in codec.state_dict().items()}
-    save_file({**table.tensors(), **codec_tensors}, table_file)
+    write_tensors(table_file, {**table.tensors(), **codec_tensors}, {})
     # Of robots, if there are any.
     own = table.length[~table.human | table.human.all()]
     horizon_latents = (int(own.max()) - 1) // STEPS_PER_LATENT
