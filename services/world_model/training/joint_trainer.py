@@ -35,7 +35,11 @@ from services.world_model.pretrained_video import (
 )
 from services.world_model.training import episode_sets, joint_dataset, resume_files
 from services.world_model.training.distribution import ALONE, Processes, load_whole, whole_weights
-from services.world_model.training.evaluation import evaluate_prediction, refuse_trained
+from services.world_model.training.evaluation import (
+    evaluate_prediction,
+    evaluated_places,
+    refuse_trained,
+)
 from services.world_model.training.joint_objective import (
     LossOptions,
     errors,
@@ -380,6 +384,8 @@ def train_on(
 ) -> TrainingReport | None:
     """`train` with episodes that are already split."""
     episode_sets.check_disjoint(trained, heldout)
+    # Before training, so that too short ones are found at once.
+    evaluated_places(heldout, settings.network.max_steps, settings.evaluation_stride)
     settings, tokenizer = with_tokenizer(settings)
     settings, layouts = settings.with_adapters(), [e.tactile_layout for e in (*trained, *heldout)]
     layout = common_layout(layouts, what="training episodes")

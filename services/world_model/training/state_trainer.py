@@ -35,7 +35,7 @@ from services.world_model.rendering.training import train_renderer
 from services.world_model.settings import StateAdaptSettings, StateTrainSettings, recorded_command
 from services.world_model.training import core_training, state_data
 from services.world_model.training.episode_sets import training_sets
-from services.world_model.training.evaluation import evaluate_dynamics
+from services.world_model.training.evaluation import check_long_enough, evaluate_dynamics
 from services.world_model.training.reader_training import OnStep, read_step, train_reader
 from services.world_model.training.scene_table import (
     SceneTable,
@@ -94,10 +94,11 @@ def train_state(settings: StateTrainSettings) -> StateReport:
         scene_table(heldout, config),
         state_data.labelled_episodes(training, settings),
     )
+    check_long_enough(heldout_table)
     share = settings.share_of_human
     table = scene_table(training, config, labelled=labelled, human_share=share)
     if settings.learn == "all":
-        state_data.check_drawable(state_data.drawn_episodes(data))
+        state_data.check_drawable(state_data.drawn_episodes(data, settings))
     codec = _codec(table, config, base)
     is_known = all(bool(table.knows_all(step).all()) for step in core_training.start_steps(table))
     reads_starts = settings.labelled_share < 1 or not is_known or bool(table.touched.any())
@@ -305,10 +306,8 @@ def _train_parts(work: _Work) -> None:
 def _train_renderer(work: _Work) -> None:
     torch.set_num_threads(1)
     settings = work.settings
-    episodes = state_data.drawn_episodes(state_data.load_state_data(settings))
+    known = state_data.drawn_episodes(state_data.load_state_data(settings), settings)
     rng = np.random.default_rng(settings.seed)
-    labelled = zip(episodes, state_data.labelled_episodes(episodes, settings), strict=True)
-    known = [episode for episode, is_labelled in labelled if is_labelled]
     chosen = rng.permutation(len(known))[:MAX_CLIPS]
     clips = scene_clips([known[index] for index in sorted(chosen)])
     lines = ProgressLines("train renderer", has_bar=False)

@@ -19,12 +19,15 @@ from services.twin.take_options import TakeOptions
 from services.world_model.checkpoints import read_state_checkpoint, write_state_checkpoint
 from services.world_model.dynamics.features import TouchCodec
 from services.world_model.settings import CoreSettings, ReaderSettings, StateTrainSettings
-from services.world_model.training import state_data
+from services.world_model.training import state_data, state_trainer
 from services.world_model.training.core_training import CoreData, _read_start, start_steps
 from services.world_model.training.reader_training import read_step, train_reader
 from services.world_model.training.scene_table import SceneTable, scene_table
 from services.world_model.training.state_data import (
+    StateData,
     check_drawable,
+    configured,
+    drawn_episodes,
     has_poses,
     labelled_episodes,
     load_scene_episodes,
@@ -338,6 +341,29 @@ def test_takes_without_poses_are_notlabelled_episodes():
     assert labelled_episodes([clicked(0), unposed(1)], settings) == [True, False]
     with pytest.raises(InvalidInputError, match="no scene with known objects of press"):
         labelled_episodes([unposed(1)], settings)
+
+
+def test_renderers_see_robots_with_poses_though_those_of_a_task_have_none():
+    people = [changed(clicked(n), domain="human") for n in range(2)]
+    other = changed(episode(7), task="lift")
+    data = StateData([*people, unposed(3), other], [episode(8)])
+    assert drawn_episodes(data, StateTrainSettings(episodes=("takes",))) == [other]
+
+
+def test_objects_of_unknown_size_are_refused():
+    boxless = [changed(episode(seed), boxes_m=np.zeros((0, 6))) for seed in range(2)]
+    data = StateData(boxless[:1], boxless[1:])
+    with pytest.raises(InvalidInputError, match=r"sizes of the objects of tasks \['press'\]"):
+        configured(data, StateTrainSettings(episodes=("takes",)))
+
+
+def test_held_out_takes_below_a_chunk_are_refused_before_training(monkeypatch, tmp_path):
+    data = StateData([episode(0), episode(1)], [episode(2, 13)])
+    monkeypatch.setattr(state_data, "load_state_data", lambda _: data)
+    monkeypatch.setattr(state_trainer, "_train_parts", lambda _: pytest.fail("trained"))
+    settings = StateTrainSettings(episodes=("takes",), output=tmp_path / "model.safetensors")
+    with pytest.raises(InvalidInputError, match="longest held-out episode has 13 steps"):
+        train_state(settings)
 
 
 def test_clicks_alone_need_a_base():

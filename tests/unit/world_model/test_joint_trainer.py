@@ -117,6 +117,14 @@ def test_held_out_episodes_cannot_be_trained_on(toy_episodes, heldout, train_set
         train_on(toy_episodes, [same_scene], train_settings)
 
 
+def test_held_out_episodes_without_a_window_are_refused_before_training(
+    toy_episodes, toy_episode, train_settings, monkeypatch
+):
+    monkeypatch.setattr(TrainingRun, "run", lambda *_: pytest.fail("trained"))
+    with pytest.raises(InvalidInputError, match="without a window of 17 steps"):
+        train_on(toy_episodes, [toy_episode(70, 12)], train_settings)
+
+
 def test_training_episodes_cannot_be_judged_on(tiny_model, toy_episodes):
     prints = [toy_episodes[2].fingerprint()]
     with pytest.raises(InvalidInputError, match="toy-2"):
