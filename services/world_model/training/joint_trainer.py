@@ -393,7 +393,8 @@ def train_on(
         known = settings.network.tactile_layout
         common_layout([known, layout], what="--tokenizer and the training episodes")
         check_unseen(heldout, tokenizer)
-    settings = settings.model_copy(update={"network": settings.network.with_layout(layout)})
+    network = _at_rate(settings.network, trained[0].model_rate_hz).with_layout(layout)
+    settings = settings.model_copy(update={"network": network})
     torch.set_num_threads(settings.num_threads)
     ancestor = None if settings.init is None else checkpoints.read_checkpoint(settings.init)
     known_tasks: set[str] = set()
@@ -441,6 +442,16 @@ def train_on(
         metrics=metrics,
         log=log,
     )
+
+
+def _at_rate(network: NetworkConfig, rate_hz: float) -> NetworkConfig:
+    """The configuration at the rate of the episodes; ConflictError if another one is requested."""
+    if "model_rate_hz" in network.model_fields_set and network.model_rate_hz != rate_hz:
+        raise ConflictError(
+            f"training: --network.model-rate-hz is {network.model_rate_hz:g} Hz, the episodes have "
+            f"steps at {rate_hz:g} Hz; leave it out, or align them at that rate"
+        )
+    return network.model_copy(update={"model_rate_hz": rate_hz})
 
 
 def _metadata(

@@ -315,11 +315,16 @@ def _correct_grips(episodes: Sequence[EpisodeGrid]) -> None:
 
 
 def check_new(data: StateData, settings: StateTrainSettings, base: Base | None) -> None:
-    """Check tasks as `check_tasks`; what is held out, the initial checkpoint has not seen."""
+    """Check rate, and tasks as `check_tasks`; the initial checkpoint has seen none held out."""
     if base is None:
         check_tasks(data.episodes, settings)
         return
-    about = base.checkpoint.metadata
+    about, rate_hz = base.checkpoint.metadata, data.training[0].about.model_rate_hz
+    if rate_hz != about.model_rate_hz:
+        raise InvalidInputError(
+            f"training: the initial checkpoint has steps at {about.model_rate_hz:g} Hz, the "
+            f"episodes at {rate_hz:g} Hz; align them at its rate (`--options.model-rate-hz`)"
+        )
     check_tasks(data.episodes, settings, {*about.dynamics.tasks, *learned_tasks(about.sets)})
     if about.dynamics.has_humans and {one.domain for one in data.training} == {"human"}:
         raise InvalidInputError(

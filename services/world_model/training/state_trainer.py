@@ -148,6 +148,7 @@ def _metadata(
         num_members=settings.num_members,
         renderer=settings.renderer,
         **_objects(data, work.config, base),
+        model_rate_hz=data.training[0].about.model_rate_hz,
         bounds=base.checkpoint.metadata.bounds if base and keeps_bounds else bounds,
         command=command,
         seed=settings.seed,
