@@ -274,6 +274,8 @@ def train_success_classifier(
     ConflictError if a held-out or development episode starts like a training episode, and
     InvalidInputError for a task with only one outcome.
     """
+    # As in each of several processes: sums over threads are rounded in another order.
+    torch.set_num_threads(1)
     torch.manual_seed(settings.seed)
     sets = ClassifierSets.split(episodes, settings, development=development, held_out=held_out)
     shape = ClassifierShape(
