@@ -36,7 +36,7 @@ from services.networks.training_settings import USUAL_IMAGE_PX
 
 IMAGINED: Final = "imagined"
 # What a take must have to be replayed.
-REPLAYED: Final = (needs.EVERY_PART, needs.WHOLE, needs.OUTCOME, needs.IMAGES)
+REPLAYED: Final = (needs.EVERY_PART, needs.WHOLE, needs.OUTCOME, needs.FIRST_IMAGE)
 # Name of the replayed actions among the policies.
 REPLAY: Final = "recorded actions"
 # With fewer takes of either outcome, an area under the curve says little.
@@ -61,15 +61,18 @@ def read_takes(
     splits: Collection[Split] = (),
     most: int | None = None,
     further_views: Sequence[str] = (),
+    chunk_multiple: int = 1,
 ) -> list[RecordedTake]:
     """Robot episodes of known outcome, whatever recorded them; imagined ones are left out.
 
-    Starts have the images of those `further_views` that a take has.
+    Starts have the images of those `further_views` that a take has. Takes without a chunk of
+    `chunk_multiple` steps after the first are left out.
 
     `tasks` and `splits` of scenes are empty for all; of each task the first `most` by their ids are
     read, None for all. Raises NotFoundError and ConflictError as `select_episodes`.
     """
-    readers = select_episodes(stores, domain="robot", tasks=tasks, splits=splits, needs=REPLAYED)
+    required = (*REPLAYED, needs.longer_than(chunk_multiple))
+    readers = select_episodes(stores, domain="robot", tasks=tasks, splits=splits, needs=required)
     takes: list[RecordedTake] = []
     counts: Counter[str] = Counter()
     for reader in readers:

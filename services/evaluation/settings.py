@@ -138,7 +138,9 @@ class TrainJudgeSettings(CommandSettings):
         default=(), description="stores to calibrate on (default: a share of the scenes)"
     )
     held_out: tuple[str, ...] = Field(
-        default=(), description="stores to evaluate on (default: a fifth of the scenes)"
+        default=(),
+        description="stores to evaluate on (default: a fifth of the scenes); --splits does not "
+        "apply",
     )
     output: Path = Field(
         default=Path("runs/evaluation/success_probe.safetensors"), description="checkpoint to write"

@@ -93,7 +93,7 @@ def optimized(
     settings: TrainingSettings,
     *,
     title: str,
-    max_gradient_norm: float | None = 1.0,
+    max_gradient_norm: float = 1.0,
 ) -> Iterator[Budget]:
     """Train a network by losses of drawn batches; yields the used budget after each step."""
     generator = torch.Generator().manual_seed(settings.seed)

@@ -53,7 +53,7 @@ def prediction_main(arguments: Sequence[str]) -> int:
         [store],
         domain="robot",
         tasks=tasks,
-        needs=(needs.EVERY_PART, needs.IMAGES, needs.longer_than(CHUNK_STEPS)),
+        needs=(needs.EVERY_PART, needs.FIRST_IMAGE, needs.longer_than(CHUNK_STEPS)),
     )
     ids = [reader.item_id for reader in readers]
     refuse_trained_episodes(store, ids, path, command="evaluate prediction")
@@ -122,6 +122,7 @@ def recorded_main(arguments: Sequence[str]) -> int:
         splits=splits,
         most=options.count,
         further_views=world.description.optional_cameras,
+        chunk_multiple=world.description.chunk_multiple,
     )
     ids = {take.episode_id for take in takes}
     for store in stores:

@@ -93,7 +93,8 @@ def read_places(
         raise InvalidInputError(f"place policy: got an image {image.shape}, expected {size}")
     motion = hand_motion(observation.action_reached[:1], anchor)
     index = config.tasks.index(task)
-    first = first_steps([image], [K_head], [observation.tactile_kpa[0]], [motion], [index])
+    touch, layout = observation.tactile_kpa[0], config.tactile_layout
+    first = first_steps([image], [K_head], [touch], [motion], [index], layout)
     with torch.no_grad():
         objects = mean_poses(stacked([reader(first).objects for reader in readers]))
     count = config.num_objects[index]
@@ -246,9 +247,10 @@ class PlacePolicy:
 
 
 def _motion_of(task: str, tensors: dict[str, torch.Tensor]) -> Motion:
-    start = f"{_MOTION}{task}."
+    # Names of tasks may have dots.
+    named = [(name.rpartition("."), tensor) for name, tensor in tensors.items()]
     return Motion.from_tensors(
-        {name.removeprefix(start): t for name, t in tensors.items() if name.startswith(start)}
+        {last: t for (first, _, last), t in named if first == _MOTION + task}
     )
 
 

@@ -67,18 +67,8 @@ def evaluate_prediction(
         InvalidInputError: an episode that was trained on, or no window at all.
     """
     refuse_trained(episodes, train_fingerprints, "the model")
-    places = [
-        (episode, start)
-        for episode in episodes
-        for start in joint_dataset.window_starts(episode, model.config.max_steps).tolist()
-        if start % stride == 0
-    ]
-    if not places:
-        raise InvalidInputError(
-            f"evaluation: got {len(episodes)} episodes without a window of "
-            f"{model.config.max_steps} steps, expected at least one"
-        )
     steps = model.config.max_steps
+    places = evaluated_places(episodes, steps, stride)
     windows = [_cut(episode, start, steps, action_kind) for episode, start in places]
     truth = Futures(
         np.stack([w.images[1:] for w in windows]),
@@ -118,6 +108,27 @@ def evaluate_prediction(
     if not model.config.use_touch:
         figures = {name: value for name, value in figures.items() if name.startswith("psnr")}
     return {**figures, "num_windows": float(len(windows))}
+
+
+def evaluated_places(
+    episodes: Sequence[joint_dataset.EpisodeArrays], num_steps: int, stride: int
+) -> list[tuple[joint_dataset.EpisodeArrays, int]]:
+    """Episodes and first steps of the windows that start at a multiple of `stride`.
+
+    Raises InvalidInputError if there is none.
+    """
+    places = [
+        (episode, start)
+        for episode in episodes
+        for start in joint_dataset.window_starts(episode, num_steps).tolist()
+        if start % stride == 0
+    ]
+    if not places:
+        raise InvalidInputError(
+            f"evaluation: got {len(episodes)} episodes without a window of {num_steps} steps, "
+            "expected at least one"
+        )
+    return places
 
 
 def refuse_trained(
@@ -228,11 +239,6 @@ def evaluate_dynamics(
     """
     figures: dict[str, float] = {}
     disagreement_m, distance = [], []
-    if int(table.length.max()) <= CHUNK_STEPS:
-        raise InvalidInputError(
-            f"state model: the longest held-out episode has {int(table.length.max())} steps, "
-            f"expected more than the {CHUNK_STEPS} of a chunk"
-        )
     last_start = table.num_steps - 1 - STEPS_PER_LATENT
     for start in (s for s in STARTS if s in table.image_steps and s <= last_start):
         imagined = _imagined(dynamics, table, start)
@@ -248,6 +254,15 @@ def evaluate_dynamics(
         distance=max(_SMALLEST_DISTANCE, float(torch.cat(distance).quantile(_BOUND_QUANTILE))),
         of_chunks=True,
     )
+
+
+def check_long_enough(heldout: SceneTable) -> None:
+    """Raise InvalidInputError, hours early, if no held-out episode has a whole chunk."""
+    if int(heldout.length.max()) <= CHUNK_STEPS:
+        raise InvalidInputError(
+            f"state model: the longest held-out episode has {int(heldout.length.max())} steps, "
+            f"expected more than the {CHUNK_STEPS} of a chunk; hold out others with --heldout STORE"
+        )
 
 
 def chunk_peaks(

@@ -35,7 +35,11 @@ from services.world_model.pretrained_video import (
 )
 from services.world_model.training import episode_sets, joint_dataset, joint_objective, resume_files
 from services.world_model.training.distribution import ALONE, Processes, load_whole, whole_weights
-from services.world_model.training.evaluation import evaluate_prediction, refuse_trained
+from services.world_model.training.evaluation import (
+    evaluate_prediction,
+    evaluated_places,
+    refuse_trained,
+)
 from services.world_model.training.latent_cache import use_latent_cache
 from services.world_model.training.tokenizer_trainer import check_unseen, with_tokenizer
 
@@ -374,6 +378,8 @@ def train_on(
 ) -> TrainingReport | None:
     """`train` with episodes that are already split."""
     episode_sets.check_disjoint(trained, heldout)
+    # Before training, so that too short ones are found at once.
+    evaluated_places(heldout, settings.network.max_steps, settings.evaluation_stride)
     settings, tokenizer = with_tokenizer(settings)
     settings, layouts = settings.with_adapters(), [e.tactile_layout for e in (*trained, *heldout)]
     layout = common_layout(layouts, what="training episodes")
@@ -381,7 +387,8 @@ def train_on(
         known = settings.network.tactile_layout
         common_layout([known, layout], what="--tokenizer and the training episodes")
         check_unseen(heldout, tokenizer)
-    settings = settings.model_copy(update={"network": settings.network.with_layout(layout)})
+    network = _at_rate(settings.network, trained[0].model_rate_hz).with_layout(layout)
+    settings = settings.model_copy(update={"network": network})
     torch.set_num_threads(settings.num_threads)
     ancestor = None if settings.init is None else checkpoints.read_checkpoint(settings.init)
     known_tasks: set[str] = set()
@@ -429,6 +436,16 @@ def train_on(
         metrics=metrics,
         log=log,
     )
+
+
+def _at_rate(network: NetworkConfig, rate_hz: float) -> NetworkConfig:
+    """The configuration at the rate of the episodes; ConflictError if another one is requested."""
+    if "model_rate_hz" in network.model_fields_set and network.model_rate_hz != rate_hz:
+        raise ConflictError(
+            f"training: --network.model-rate-hz is {network.model_rate_hz:g} Hz, the episodes have "
+            f"steps at {rate_hz:g} Hz; leave it out, or align them at that rate"
+        )
+    return network.model_copy(update={"model_rate_hz": rate_hz})
 
 
 def _metadata(

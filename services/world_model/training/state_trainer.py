@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from dextouch.episodes import data_hash
@@ -34,7 +34,7 @@ from services.world_model.rendering.training import train_renderer
 from services.world_model.settings import StateAdaptSettings, StateTrainSettings, recorded_command
 from services.world_model.training import member_training, state_data
 from services.world_model.training.episode_sets import training_sets
-from services.world_model.training.evaluation import evaluate_dynamics
+from services.world_model.training.evaluation import check_long_enough, evaluate_dynamics
 from services.world_model.training.scene_table import (
     SceneTable,
     scene_clips,
@@ -86,23 +86,23 @@ def train_state(settings: StateTrainSettings) -> StateReport:
         settings = _with_base(base, config, settings)
         config = base.configured(config, keeps_tasks=settings.learn == "success")
     parts = settings.output.with_suffix(".parts")
-    parts.mkdir(parents=True, exist_ok=True)
     hashed = data_hash((e.content_sha256 for e in training), image_px=_unusual_px(settings))
     # Before training, so that invalid episodes are found at once.
     heldout_table, labelled = (
         scene_table(heldout, config),
         state_data.labelled_episodes(training, settings),
     )
+    check_long_enough(heldout_table)
     share = settings.share_of_human
     table = scene_table(training, config, labelled=labelled, human_share=share)
     if settings.learn == "all":
-        state_data.check_drawable(state_data.drawn_episodes(data))
+        state_data.check_drawable(state_data.drawn_episodes(data, settings))
     codec = _codec(table, config, base)
     is_known = all(bool(table.knows_all(step).all()) for step in member_training.start_steps(table))
     reads_starts = settings.labelled_share < 1 or not is_known or bool(table.touched.any())
     table_file = parts / "table.safetensors"
     codec_tensors = {f"codec/{name}": value for name, value in codec.state_dict().items()}
-    save_file({**table.tensors(), **codec_tensors}, table_file)
+    write_tensors(table_file, {**table.tensors(), **codec_tensors}, {})
     # Of robots, if there are any.
     own = table.length[~table.human | table.human.all()]
     horizon_latents = (int(own.max()) - 1) // STEPS_PER_LATENT
@@ -139,6 +139,7 @@ def _metadata(
         num_members=settings.num_members,
         renderer=settings.renderer,
         **_objects(data, work.config, base),
+        model_rate_hz=data.training[0].about.model_rate_hz,
         bounds=base.checkpoint.metadata.bounds if base and keeps_bounds else bounds,
         command=command,
         seed=settings.seed,
@@ -297,10 +298,8 @@ def _train_parts(work: _Work) -> None:
 def _train_renderer(work: _Work) -> None:
     torch.set_num_threads(1)
     settings = work.settings
-    episodes = state_data.drawn_episodes(state_data.load_state_data(settings))
+    known = state_data.drawn_episodes(state_data.load_state_data(settings), settings)
     rng = np.random.default_rng(settings.seed)
-    labelled = zip(episodes, state_data.labelled_episodes(episodes, settings), strict=True)
-    known = [episode for episode, is_labelled in labelled if is_labelled]
     chosen = rng.permutation(len(known))[:MAX_CLIPS]
     clips = scene_clips([known[index] for index in sorted(chosen)])
     network, cpu_s = train_renderer(

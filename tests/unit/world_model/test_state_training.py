@@ -1,6 +1,7 @@
 """Start readers and cores learn a toy scene: a bright block that a descending hand presses."""
 
 import dataclasses
+import shlex
 from collections import Counter
 from pathlib import Path
 
@@ -548,12 +549,14 @@ def test_the_command_in_a_checkpoint_can_be_typed_again():
         tasks=("press",),
         init=Path("/models/cores.safetensors"),
         core=CoreSettings(num_steps=7, weights=CoreLossWeights(touch=0.0)),
+        name="first try",
         json=Path("/somewhere/figures.json"),
     )
     command = _command(settings)
     assert command.startswith("dextouch train world-model --episodes=takes --episodes=more ")
     assert "/" not in command
-    again = load_settings(TrainStateCommand, command.split()[3:])
+    again = load_settings(TrainStateCommand, shlex.split(command)[3:])
+    assert again.name == "first try"
     assert again.core.num_steps == 7
     assert again.init == Path("cores.safetensors")
     assert again.core.weights.touch == 0.0
