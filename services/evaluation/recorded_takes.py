@@ -191,8 +191,7 @@ def score_recorded(
     Rollouts last as long as their takes, whole chunks of the world; a failed one is recorded as a
     failure, and the others continue. `trained_on` maps trained components, beside the judge, to
     digests of their training starts. Raises ConflictError for a take that was trained on, and
-    InvalidInputError for a task, touch, images, a rate or a length that the world or the judge do
-    not know.
+    InvalidInputError for a task, touch, images or a rate that the world or the judge do not know.
     """
     digests = [digest for take in takes for digest in _digests(take.start)]
     judged = {"the success classifier": probe.metadata.training_starts}
@@ -209,11 +208,6 @@ def score_recorded(
                 f"({', '.join(description.tasks)}) and of the judge "
                 f"({', '.join(probe.metadata.settings['instructions'])}); train both on it, or "
                 "choose --tasks"
-            )
-        if len(take.actions) < multiple:
-            raise InvalidInputError(
-                f"take {take.episode_id!r}: has {len(take.actions)} steps after the first, "
-                f"expected at least the {multiple} of a chunk"
             )
     if description.image_height_px != probe.shape.image_size_px:
         raise InvalidInputError(
