@@ -143,7 +143,8 @@ class RecordedScores:
         if min(real.sum(), (~real).sum()) >= LEAST_OF_EACH:
             probability = np.array([one.probability for one in scores])
             figures["auc"] = area_under_roc(probability, real)
-            interval = area_interval(figures["auc"], real.sum(), (~real).sum())
+            num_successes = int(real.sum())
+            interval = area_interval(figures["auc"], num_successes, len(real) - num_successes)
             figures["auc_interval"] = [interval.low, interval.high]
         return figures
 
@@ -184,8 +185,7 @@ def score_recorded(
     Rollouts last as long as their takes, whole chunks of the world; a failed one is recorded as a
     failure, and the others continue. `trained_on` maps trained components, beside the judge, to
     digests of their training starts. Raises ConflictError for a take that was trained on, and
-    InvalidInputError for a task, touch, images, a rate or a length that the world or the judge do
-    not know.
+    InvalidInputError for a task, touch, images or a rate that the world or the judge do not know.
     """
     digests = [digest for take in takes for digest in _digests(take.start)]
     judged = {"the success classifier": probe.metadata.training_starts}
@@ -202,11 +202,6 @@ def score_recorded(
                 f"({', '.join(description.tasks)}) and of the judge "
                 f"({', '.join(probe.metadata.settings['instructions'])}); train both on it, or "
                 "choose --tasks"
-            )
-        if len(take.actions) < multiple:
-            raise InvalidInputError(
-                f"take {take.episode_id!r}: has {len(take.actions)} steps after the first, "
-                f"expected at least the {multiple} of a chunk"
             )
     if description.image_height_px != probe.shape.image_size_px:
         raise InvalidInputError(

@@ -37,7 +37,12 @@ from dextouch.tactile.layout import DEXTOUCH_V1, common_layout
 from services.world_model.checkpoints import learned_tasks
 from services.world_model.dynamics.features import DynamicsConfig
 from services.world_model.settings import StateTrainSettings
-from services.world_model.training.episode_sets import check_stores, check_tasks, subset_by_hash
+from services.world_model.training.episode_sets import (
+    check_stores,
+    check_tasks,
+    outside_scenes,
+    subset_by_hash,
+)
 from services.world_model.training.scene_table import usual_boxes_m, vocabulary
 from services.world_model.training.transfer import Base
 
@@ -260,11 +265,7 @@ def load_state_data(settings: StateTrainSettings) -> StateData:
     training = subset_by_hash(training, settings.robot_episodes, what="robot")
     if settings.human and settings.human_episodes != 0:
         people = load(*settings.human, splits=settings.splits, domain="human")
-        scenes, num_people = {episode.scene for episode in heldout}, len(people)
-        people = [episode for episode in people if episode.scene not in scenes]
-        if len(people) < num_people:
-            reason = "people in scenes that are held out of the robots'"
-            logger.warning("skipped_episodes", reason=reason, count=num_people - len(people))
+        people = outside_scenes(people, heldout)
         training += subset_by_hash(people, settings.human_episodes, what="human")
     if len({episode.domain for episode in training}) > 1:
         heldout = [episode for episode in heldout if episode.domain == "robot"]
