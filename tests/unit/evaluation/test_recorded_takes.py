@@ -112,7 +112,7 @@ def test_a_right_world_earns_trust_and_a_wrong_one_does_not(store, client, probe
     assert trusted["takes"] == len(SEEDS)
     assert trusted["real"] == np.mean([item.success for item in items])
     assert trusted["auc"] > 0.95
-    assert trusted["auc_interval"][0] > 0.7
+    assert trusted["auc_interval"][0] > 0.6
     assert trusted["wrong"] < 0.15
     assert distrusted["auc"] < 0.8
     row = right.policy_row("hold", "reach")
