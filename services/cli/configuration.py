@@ -96,7 +96,9 @@ def unknown_variables(section: str, environment: Iterable[str]) -> list[str]:
     """
     prefixes = [f"DEXTOUCH_{name.upper()}_" for name in SECTIONS]
     own = f"DEXTOUCH_{section.upper()}_"
-    known = [name.upper() for name in settings_class(section).model_fields]
+    # Those with a name of their own, such as that of --json, have no variable.
+    fields = settings_class(section).model_fields.items()
+    known = [name.upper() for name, field in fields if field.validation_alias is None]
     problems = []
     for variable in sorted(environment):
         name = variable.upper().partition("__")[0]
@@ -104,7 +106,7 @@ def unknown_variables(section: str, environment: Iterable[str]) -> list[str]:
         nearest = max((one for one in prefixes if name.startswith(one)), key=len, default="")
         setting = name.removeprefix(nearest)
         if nearest == own and setting not in known:
-            meant = get_close_matches(setting, known, n=1)
+            meant = get_close_matches(setting, known, n=1, cutoff=0.75)
             hint = f"see dextouch config show {section}"
             if meant:
                 hint = f"did you mean {own}{meant[0]}?"

@@ -141,6 +141,11 @@ class ClassifierNetwork(nn.Module):
         super().__init__()
         self.num_outputs = shape.num_outputs
         self.tasks = nn.ModuleDict({_module_name(task): TaskNetwork(shape) for task in shape.tasks})
+        if len(self.tasks) < len(shape.tasks):
+            raise InvalidInputError(
+                f"success classifier: of the tasks {', '.join(shape.tasks)} two have one name once "
+                "'.' is written '%2E'; relabel one of them"
+            )
 
     def of(self, task: str) -> TaskNetwork:
         """The network of one task."""

@@ -4,7 +4,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from operator import attrgetter
 from typing import Any, Final
 
 import numpy as np
@@ -231,9 +230,13 @@ class ClassifierSets:
         sets = cls(training, calibrated, tested)
         learned = [*training, *calibrated]
         for others, trained_on in ((calibrated, training), (tested, learned)):
-            for mark in map(attrgetter, ("start_digest", "scene")):
-                known, what = map(mark, trained_on), "the success classifier"
-                refuse_training_starts(map(mark, others), trained_on=known, what=what)
+            refuse = partial(refuse_training_starts, what="the success classifier")
+            refuse(
+                (e.start_digest for e in others), trained_on=(e.start_digest for e in trained_on)
+            )
+            refuse(
+                (e.scene for e in others), trained_on=(e.scene for e in trained_on), noun="scenes"
+            )
         return sets
 
     @property

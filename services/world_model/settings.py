@@ -356,7 +356,7 @@ def recorded_command(
 
     given = settings.model_dump(mode="json", exclude_defaults=True, exclude=left_out)
     known = {name: given.pop(name) for name in places if name in given}
-    return f"{command} {shlex.join([*flags_of(known, last_name), *flags_of(given)])}"
+    return f"{command} {shlex.join([*flags_of(known, last_name), *flags_of(given)])}".rstrip()
 
 
 def flags_of(

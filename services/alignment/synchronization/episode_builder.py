@@ -489,7 +489,9 @@ def _pad_forces_n(layout: TactileLayout, kpa: np.ndarray) -> Float64[np.ndarray,
     """Forces of pads; NaN of those that miss a taxel."""
     is_missing = ~np.isfinite(kpa)
     forces_n = layout.pad_forces_n(np.where(is_missing, 0.0, kpa))
-    return np.where(layout.by_part(is_missing, np.any), np.nan, forces_n)
+    some = is_missing.any(axis=1)
+    forces_n[some] = np.where(layout.by_part(is_missing[some], np.any), np.nan, forces_n[some])
+    return forces_n
 
 
 def _seen(stream: LoadedStream) -> LoadedStream:

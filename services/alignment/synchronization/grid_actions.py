@@ -46,12 +46,14 @@ REST_RAD_S = 0.1
 class GriddedStreams:
     """Streams of which actions are made, and where steps of the grid are `at`.
 
-    `TOUCH_STREAMS` are forces (N) of pads, which are placed each for itself (`pad_forces_n`).
+    `TOUCH_STREAMS` are forces (N) of pads, which are placed each for itself (`pad_forces_n`),
+    across gaps up to `max_gap_ns`, or `TOUCH_GAP_NS` if that is longer.
     """
 
     grid_ns: Int64[np.ndarray, " n"]
     streams: Mapping[str, LoadedStream]
     at: Mapping[str, GridPlacement]
+    max_gap_ns: int = 0
 
     @property
     def valid(self) -> Bool[np.ndarray, " n"]:
@@ -74,7 +76,7 @@ class GriddedStreams:
         if (stream := self.streams.get(f"tactile_{side}")) is None:
             return forces_n
         period_ns = stream.descriptor.period_ns()
-        gap_ns = stream_gap_ns(TOUCH_GAP_NS, period_ns)
+        gap_ns = max(stream_gap_ns(self.max_gap_ns, period_ns), TOUCH_GAP_NS)
         for pad, pad_n in enumerate(stream.values.T):
             known = np.isfinite(pad_n)
             t_ns = stream.t_ns[known]
@@ -128,7 +130,7 @@ def place_streams(
             period_ns = stream.descriptor.period_ns()
             gap_ns = stream_gap_ns(max_gap_ns, period_ns)
             at[name] = place_on_grid(stream.t_ns, grid_ns, period_ns=period_ns, max_gap_ns=gap_ns)
-    return GriddedStreams(grid_ns, streams, at)
+    return GriddedStreams(grid_ns, streams, at, max_gap_ns)
 
 
 def make_actions(

@@ -21,7 +21,7 @@ from torch import Tensor, nn
 _CALLS_BEFORE: Final = 4
 _MOST_TRACES: Final = 16
 _WARM_UP_CALLS: Final = 3
-_Leaf: Final = (Tensor, np.ndarray)
+_LEAF_TYPES: Final = (Tensor, np.ndarray)
 Part = TypeVar("Part")
 Outputs = TypeVar("Outputs")
 
@@ -126,7 +126,7 @@ class Traced(Generic[Outputs]):
 
 def _tensors(part: Any) -> Iterator[Any]:  # noqa: ANN401 - any nesting of dataclasses
     """All tensors of dataclasses and tuples of these, in the order of their fields."""
-    if isinstance(part, _Leaf):
+    if isinstance(part, _LEAF_TYPES):
         yield part
     else:
         for one in _parts(part):
@@ -134,7 +134,7 @@ def _tensors(part: Any) -> Iterator[Any]:  # noqa: ANN401 - any nesting of datac
 
 
 def _rebuilt(form: Any, tensors: Iterator[Any]) -> Any:  # noqa: ANN401 - any nesting of dataclasses
-    if isinstance(form, _Leaf):
+    if isinstance(form, _LEAF_TYPES):
         return next(tensors)
     parts = [_rebuilt(one, tensors) for one in _parts(form)]
     return tuple(parts) if isinstance(form, tuple) else type(form)(*parts)
@@ -142,7 +142,7 @@ def _rebuilt(form: Any, tensors: Iterator[Any]) -> Any:  # noqa: ANN401 - any ne
 
 def _names(part: Any, name: str = "") -> Iterator[str]:  # noqa: ANN401 - as above
     """Names of the tensors of dataclasses and tuples, in the order of `_tensors`."""
-    if isinstance(part, _Leaf):
+    if isinstance(part, _LEAF_TYPES):
         yield name
         return
     named_by = map(str, range(len(part))) if isinstance(part, tuple) else _fields(part.__class__)

@@ -387,7 +387,7 @@ def train_on(
         known = settings.network.tactile_layout
         common_layout([known, layout], what="--tokenizer and the training episodes")
         check_unseen(heldout, tokenizer)
-    network = _at_rate(settings.network, trained[0].model_rate_hz).with_layout(layout)
+    network = _at_rate(settings, trained[0].model_rate_hz).with_layout(layout)
     settings = settings.model_copy(update={"network": network})
     torch.set_num_threads(settings.num_threads)
     ancestor = None if settings.init is None else checkpoints.read_checkpoint(settings.init)
@@ -438,12 +438,16 @@ def train_on(
     )
 
 
-def _at_rate(network: NetworkConfig, rate_hz: float) -> NetworkConfig:
+def _at_rate(settings: TrainSettings, rate_hz: float) -> NetworkConfig:
     """The configuration at the rate of the episodes; ConflictError if another one is requested."""
+    network = settings.network
     if "model_rate_hz" in network.model_fields_set and network.model_rate_hz != rate_hz:
+        has, advice = "--network.model-rate-hz is", "leave it out, or align them at that rate"
+        if settings.init is not None:
+            has, advice = f"{settings.init} has steps at", "align them at its rate"
         raise ConflictError(
-            f"training: --network.model-rate-hz is {network.model_rate_hz:g} Hz, the episodes have "
-            f"steps at {rate_hz:g} Hz; leave it out, or align them at that rate"
+            f"training: {has} {network.model_rate_hz:g} Hz, the episodes have steps at "
+            f"{rate_hz:g} Hz; {advice}"
         )
     return network.model_copy(update={"model_rate_hz": rate_hz})
 

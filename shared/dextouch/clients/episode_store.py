@@ -264,7 +264,7 @@ class EpisodeStoreClient:
             )
         except httpx.TransportError as error:
             raise UnavailableError(
-                f"episode store at {self._http.base_url}: {method} {path} got no answer "
+                f"episode store at {_shown(self._http.base_url)}: {method} {path} got no answer "
                 f"({type(error).__name__}: {error}); check the address or try again later"
             ) from error
         if response.is_success:
@@ -272,9 +272,14 @@ class EpisodeStoreClient:
         raise _refusal(response)
 
 
+def _shown(url: httpx.URL) -> httpx.URL:
+    """An address without the name and password that it may hold, and without its query."""
+    return url.copy_with(query=None, username=None, password=None)
+
+
 def _refusal(response: httpx.Response) -> DexTouchError:
     try:
-        where = f"{response.request.method} {response.request.url.copy_with(query=None)}"
+        where = f"{response.request.method} {_shown(response.request.url)}"
         return schemas.error_from_problem(
             schemas.Problem.model_validate_json(response.content), where
         )

@@ -147,6 +147,14 @@ def test_a_section_is_not_taken_for_a_setting_of_one_whose_name_it_begins_with()
     assert not configuration.unknown_variables("twin", given)
 
 
+def test_variables_of_the_chosen_form_are_looked_at_and_aliases_are_none(monkeypatch, capsys):
+    monkeypatch.setenv("DEXTOUCH_WORLD_MODEL_TRAIN_SEEED", "1")
+    assert main(["train", "world-model", "--preset", "tiny"]) == 3
+    assert "did you mean DEXTOUCH_WORLD_MODEL_TRAIN_SEED?" in capsys.readouterr().err
+    (problem,) = configuration.unknown_variables("up", ["DEXTOUCH_UP_JSON_PATH"])
+    assert problem.endswith("see dextouch config show up")
+
+
 @pytest.mark.long
 def test_show_says_where_each_setting_comes_from(write, monkeypatch, capsys):
     write(FILE)

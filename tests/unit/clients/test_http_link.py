@@ -163,3 +163,20 @@ def test_nobody_waits_for_a_service_that_was_never_there(free_port):
     with pytest.raises(UnavailableError, match="is the service running"):
         link.request("GET", "/")
     assert pauses == [0.05, 0.2, 0.8]
+
+
+def test_no_message_has_a_password_of_the_address():
+    problem = {"type": "urn:dextouch:error:AccessDeniedError", "title": "t", "status": 401}
+    replies = iter([httpx.Response(401, json=problem | {"detail": "no"}), httpx.ReadError("cut")])
+
+    def reply(_):
+        if isinstance(one := next(replies), Exception):
+            raise one
+        return one
+
+    transport = httpx.MockTransport(reply)
+    client = EpisodeStoreClient("http://user:s3cret@store.lab:8081", transport=transport)
+    for kind in (AccessDeniedError, UnavailableError):
+        with pytest.raises(kind, match=r"http://store\.lab:8081") as refused:
+            client.uploads()
+        assert "s3cret" not in refused.value.message

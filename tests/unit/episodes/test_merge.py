@@ -217,6 +217,8 @@ def test_a_dry_run_of_several_stores_counts_as_the_merge_does(stores, rename):
     for store in (one, two):
         write_take(store, "take")
         write_episode(store, "same")
+        write_episode(store, "twice", num_steps=25)
+    write_episode(target, "twice")
     write_episode(one, "other")
     write_episode(two, "other", num_steps=30)
     planned, done = (

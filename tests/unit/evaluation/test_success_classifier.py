@@ -101,7 +101,7 @@ def test_what_was_imagined_of_a_held_out_scene_is_not_trained_on(demonstrations)
     # As a world that sees smaller images than the take has.
     imagined = replace(episodes[3], episode_id="imagined", start_digest="another")
     for others in ({"held_out": [imagined]}, {"development": [imagined]}):
-        with pytest.raises(ConflictError, match="trained on by the success classifier"):
+        with pytest.raises(ConflictError, match=f"1 scenes were trained on .*{imagined.scene};"):
             ClassifierSets.split(episodes, ClassifierSettings(), **others)
 
 
@@ -110,6 +110,8 @@ def test_tasks_have_any_name(demonstrations):
     network = ClassifierNetwork(ClassifierShape(tasks=names))
     assert len({id(network.of(name)) for name in names}) == len(names)
     assert any(name.startswith("tasks.reach.") for name in network.state_dict())
+    with pytest.raises(InvalidInputError, match="two have one name"):
+        ClassifierNetwork(ClassifierShape(tasks=("a.b", "a%2Eb")))
 
 
 def test_a_training_that_diverges_is_named(demonstrations):

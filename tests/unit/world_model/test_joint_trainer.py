@@ -135,6 +135,9 @@ def test_a_model_has_the_rate_of_its_episodes(toy_episodes, heldout, train_setti
     network = settings.network.model_copy(update={"model_rate_hz": 20.0})
     with pytest.raises(ConflictError, match="is 20 Hz, the episodes have steps at 30 Hz"):
         train_on(fast, others, settings.model_copy(update={"network": network}))
+    slow = settings.model_copy(update={"network": network, "init": report.checkpoint})
+    with pytest.raises(ConflictError, match=r"safetensors has steps at 20 Hz.*align them at its"):
+        train_on(fast, others, slow)
 
 
 def test_training_episodes_cannot_be_judged_on(tiny_model, toy_episodes):

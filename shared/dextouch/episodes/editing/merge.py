@@ -112,8 +112,9 @@ class _Origins:
 
     def __init__(self, store: EpisodeStore) -> None:
         self._store = store
-        # Hashes of the contents that a dry run would have copied so far, by kind and id.
+        # What a dry run would have copied so far: hashes by kind and new id, and the reverse.
         self.planned: dict[tuple[str, str], str] = {}
+        self.planned_ids: dict[tuple[str, str], str] = {}
 
     @cached_property
     def _found(self) -> defaultdict[tuple[str, str], list[LineageEntry]]:
@@ -180,6 +181,8 @@ class _Merge:
                 f"{name!r}: it, its recording or its operator was permanently deleted from the "
                 f"target on {covered.deleted_at:%Y-%m-%d}"
             )
+        if (planned_id := self.origins.planned_ids.get((kind, sha256))) is not None:
+            return MergeReport(kind, name, source.url, "there", planned_id)
         ours = self._sha256_in_target(kind, name)
         remarks = self._remarks(kind, name)
         if ours == sha256:
@@ -207,6 +210,7 @@ class _Merge:
             attributes = attributes.model_copy(update=changes)
         if self.options.dry_run:
             self.origins.planned[kind, new_id] = sha256
+            self.origins.planned_ids[kind, sha256] = new_id
         else:
             reader.verify()
             copy_item(source, target, reader, attributes, remarks)
@@ -281,8 +285,6 @@ class _Merge:
     ) -> tuple[str, ...]:
         """Give an item in the target the remarks that only its copy has; returns their names."""
         target = self.target
-        if (kind, name) in self.origins.planned:
-            return ()
         ours = {
             REVIEW_FILE: target.review(name, kind=kind),
             CLICKS_FILE: target.clicks(name) if kind == "episode" else None,
