@@ -23,7 +23,7 @@ from dextouch.errors import (
     NonFiniteError,
     ShapeError,
 )
-from dextouch.frozen_model import FrozenModel, is_none
+from dextouch.frozen_model import FrozenModel
 from dextouch.geometry import rigid_error
 from dextouch.hands.actions import ACTION_DIM, AnchorPoses, all_finite
 from dextouch.images import decode_jpeg, encode_jpeg, jpeg_size
@@ -229,7 +229,9 @@ class ObservationFields(FrozenModel):
     first_step: int
     reached_is_measured: bool
     success: bool | None = None
-    uncertainty: Uncertainty | None = Field(default=None, exclude_if=is_none, alias="doubt")
+    uncertainty: Uncertainty | None = Field(
+        default=None, exclude_if=lambda one: one is None, alias="doubt"
+    )
 
 
 class AnswerFields(FrozenModel):

@@ -8,7 +8,7 @@ from pydantic import ConfigDict, Field, model_validator
 
 from dextouch.errors import InvalidInputError
 from dextouch.free_text import FreeText
-from dextouch.frozen_model import FrozenModel, example, is_none
+from dextouch.frozen_model import FrozenModel, example
 from dextouch.schemas.common import MAX_INSTRUCTION
 from dextouch.tactile import LayoutDescription
 
@@ -89,7 +89,9 @@ class WorldDescription(FrozenModel):
     optional_cameras: tuple[str, ...] = Field(default=(), exclude_if=not_)
     predicts_touch: bool = Field(default=True, exclude_if=bool)
     scales_images: bool = Field(default=False, exclude_if=not_)
-    tactile_layout: LayoutDescription | None = Field(default=None, exclude_if=is_none)
+    tactile_layout: LayoutDescription | None = Field(
+        default=None, exclude_if=lambda one: one is None
+    )
 
     @property
     def num_taxels(self) -> int:
@@ -164,10 +166,14 @@ class Uncertainty(FrozenModel):
     distance: float = Field(ge=0, allow_inf_nan=False)
     outside: bool = False
     reason: str | None = Field(default=None, min_length=1, max_length=500)
-    success_probability: float | None = Field(default=None, ge=0, le=1, exclude_if=is_none)
-    success_spread: float | None = Field(default=None, ge=0, le=1, exclude_if=is_none)
+    success_probability: float | None = Field(
+        default=None, ge=0, le=1, exclude_if=lambda one: one is None
+    )
+    success_spread: float | None = Field(
+        default=None, ge=0, le=1, exclude_if=lambda one: one is None
+    )
     size_deviation: float | None = Field(
-        default=None, ge=0, allow_inf_nan=False, exclude_if=is_none
+        default=None, ge=0, allow_inf_nan=False, exclude_if=lambda one: one is None
     )
 
     @model_validator(mode="after")
@@ -247,9 +253,9 @@ class RolloutInfo(FrozenModel):
     next_chunk: int
     last_step: int
     ttl_s: float
-    ended: str | None = Field(default=None, exclude_if=is_none)
+    ended: str | None = Field(default=None, exclude_if=lambda one: one is None)
     rollout_uncertainty: RolloutUncertainty | None = Field(
-        default=None, exclude_if=is_none, alias="rollout_doubt"
+        default=None, exclude_if=lambda one: one is None, alias="rollout_doubt"
     )
 
     def after(self, uncertainty: Uncertainty | None, num_steps: int) -> "RolloutInfo":
