@@ -75,7 +75,7 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], notes: dict[str, st
             partial.replace(path)
         except SafetensorError as error:
             # Of the disk, which may be full: its text is all that safetensors passes on.
-            raise StorageError(f"write {path}: {error}; is the disk full?") from error
+            raise StorageError(f"write {path}: {error}; free space if the disk is full") from error
         finally:
             partial.unlink(missing_ok=True)
     return digest
