@@ -188,4 +188,4 @@ check-environments:      ## opt-in: install the package beside LeRobot and with 
 	$(PYTHON) tests/environments/check.py $(ARGS)
 
 clean:
-	rm -rf $(SITE) demo runs .pytest_cache .mypy_cache .ruff_cache .import_linter_cache
+	rm -rf $(SITE) demo .pytest_cache .mypy_cache .ruff_cache .import_linter_cache

@@ -69,7 +69,7 @@ from services.world_model.dynamics.start_reader import TASK_WIDTH, FirstStep, Re
 from services.world_model.dynamics.tensor_trees import combined, mapped
 from services.world_model.predicted_world import observed_start
 from services.world_model.settings import ReaderSettings
-from services.world_model.training.reader_training import read_step, train_reader
+from services.world_model.training.member_training import read_step, train_reader
 from services.world_model.training.scene_table import SceneTable, scene_table, vocabulary
 
 KIND: Final = "direct-judge-2"

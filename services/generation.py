@@ -74,6 +74,10 @@ def imagine_episode(
             "object_boxes_m": (),
             "event_times_s": {},
             "generator_command": None,
+            # The source's lens and refused taxels are not the world's; its actions were played.
+            "calibration": {
+                k: v for k, v in attributes.calibration.items() if k.startswith("interpolated_")
+            },
             "streams": (),
             "K_head": matrix_rows(K_head),
             "quality": attributes.quality | rollout_uncertainty(seen).to_quality(),

@@ -21,11 +21,18 @@ from scipy.optimize import least_squares
 
 from dextouch.errors import LimitExceededError
 from dextouch.geometry.rotations import rotation_from_vector
-from dextouch.hands import CHAINS, NODE_INDEX, NUM_KEYPOINTS, chain_indices, solver_indices
+from dextouch.hands import (
+    CHAINS,
+    METACARPAL_NODES,
+    NODE_INDEX,
+    NUM_KEYPOINTS,
+    chain_indices,
+    mean_hand_m,
+    solver_indices,
+)
 from dextouch.hands.robot_hand import NUM_FINGERS, NUM_JOINTS, HandModel, JointRow
 from dextouch.tactile.layout import Side
 from services.twin.hands import (
-    METACARPAL_BASES_M,
     PALM_THICKNESS_M,
     HumanHand,
     TwinHand,
@@ -256,9 +263,7 @@ def oblique_motion(side: Side, oblique_deg: float, num_samples: int, seed: int) 
     keypoints_m = np.zeros((num_samples, NUM_KEYPOINTS, 3))
     for finger, chain in enumerate(CHAINS):
         keypoints_m[:, solver_indices(chain)] = chains[:, finger]
-    mirror = np.array([1.0, 1.0 if side == "right" else -1.0, 1.0])
-    for chain, base_m in METACARPAL_BASES_M.items():
-        keypoints_m[:, NODE_INDEX[chain, "metacarpal"]] = base_m * mirror
+    keypoints_m[:, METACARPAL_NODES] = mean_hand_m(side)[METACARPAL_NODES, :]
     return Motion(side, joints_rad, keypoints_m, chains[:, :, 3])
 
 
@@ -443,8 +448,7 @@ class Person(HumanHand):
     def keypoints_m(self, joints_rad: np.ndarray) -> Float64[np.ndarray, "time 25 3"]:
         """The 25 tracked nodes in wrist coordinates, metres, for joint angles [T, 20]."""
         keypoints = super().keypoints_m(joints_rad)
-        for chain in METACARPAL_BASES_M:
-            keypoints[:, NODE_INDEX[chain, "metacarpal"]] *= self.size
+        keypoints[:, METACARPAL_NODES] *= self.size
         return keypoints
 
 

@@ -169,7 +169,7 @@ class SerialTransport(HandleTransport["serial.Serial"]):
     devices ignore the baud rate.
     """
 
-    advice = "is it in use?"
+    advice = "is it unplugged, in use, or not allowed for this user (`dextouch doctor`)?"
 
     def __init__(
         self,

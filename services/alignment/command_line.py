@@ -67,9 +67,10 @@ def main(argv: Sequence[str]) -> int:
 def _run(parsed: argparse.Namespace, settings: AlignmentSettings) -> int:
     if parsed.all == bool(parsed.recordings):
         raise InvalidInputError("run: expected either ID … or --all; see run --help")
+    store = EpisodeStore(parsed.store).require_folder()
     recording_ids, refused = list(dict.fromkeys(parsed.recordings)), list[Outcome]()
     if parsed.all:
-        recording_ids, refused = not_aligned(EpisodeStore(parsed.store), settings.wanted_options)
+        recording_ids, refused = not_aligned(store, settings.wanted_options)
     console = Console(highlight=False, soft_wrap=True)
     reports, num_failed = [], 0
     batch = parsed.store, recording_ids, settings.wanted_options
@@ -86,7 +87,7 @@ def _run(parsed: argparse.Namespace, settings: AlignmentSettings) -> int:
                 console.print(printable(report_line(result)), markup=False)
                 reports.append(json_ready(result))
     if not reports and not num_failed:
-        console.print("nothing to do: every recording has its episode")
+        console.print("nothing to do: no recording without its episode")
     write_result(parsed.json, reports)
     return EXIT_REFUSED if num_failed else 0
 
@@ -115,7 +116,7 @@ def _bars(console: Console, num_recordings: int) -> Iterator[OnRecordingProgress
 
 
 def _report(parsed: argparse.Namespace, settings: AlignmentSettings) -> int:
-    episode = _find_episode(EpisodeStore(parsed.store), parsed.id, settings.wanted_options)
+    episode = _find_episode(parsed, settings)
     recordings = [entry.id for entry in episode.attributes.lineage if entry.kind == "recording"]
     report = report_of(episode, recording_id=(recordings or [parsed.id])[-1], created=False)
     width = None if sys.stdout.isatty() else PAGE_WIDTH
@@ -126,7 +127,7 @@ def _report(parsed: argparse.Namespace, settings: AlignmentSettings) -> int:
 
 def _retarget(parsed: argparse.Namespace, settings: AlignmentSettings) -> int:
     hand = load_hand(parsed.model, parsed.mapping)
-    episode = _find_episode(EpisodeStore(parsed.store), parsed.id, settings.wanted_options)
+    episode = _find_episode(parsed, settings)
     name = f"keypoints_{hand.side}"
     if name not in episode.streams:
         raise NotFoundError(
@@ -242,10 +243,17 @@ def not_aligned(store: EpisodeStore, options: AlignmentOptions) -> tuple[list[st
     return recording_ids, refused
 
 
-def _find_episode(store: EpisodeStore, item_id: str, options: AlignmentOptions) -> EpisodeReader:
+def _find_episode(parsed: argparse.Namespace, settings: AlignmentSettings) -> EpisodeReader:
+    store, item_id = EpisodeStore(parsed.store).require_folder(), parsed.id
     if store.exists(item_id):
         return store.open(item_id)
-    return store.open(episode_id_of(store.recording(item_id), options))
+    episode_id = episode_id_of(store.recording(item_id), settings.wanted_options)
+    if not store.exists(episode_id):
+        raise NotFoundError(
+            f"recording {item_id!r}: has no episode of the present settings ({episode_id}); make "
+            f"it with `dextouch align run {item_id}`, or name another of `dextouch store list`"
+        )
+    return store.open(episode_id)
 
 
 def report_line(report: AlignmentReport) -> str:

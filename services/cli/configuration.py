@@ -5,7 +5,8 @@ import importlib
 import json
 import os
 import textwrap
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, Final, NamedTuple, get_args
 
@@ -85,6 +86,32 @@ def apply_configuration() -> None:
                 f"{path}:{serving.line_of(path, (name,))}: unknown section [{name}], expected one "
                 f"of {', '.join(SECTIONS)}"
             )
+
+
+def unknown_variables(section: str, environment: Iterable[str]) -> list[str]:
+    """What is wrong with those environment variables of a section that set nothing.
+
+    Each is described with the setting that was probably meant; fields of nested settings are not
+    looked at.
+    """
+    prefixes = [f"DEXTOUCH_{name.upper()}_" for name in SECTIONS]
+    own = f"DEXTOUCH_{section.upper()}_"
+    # Those with a name of their own, such as that of --json, have no variable.
+    fields = settings_class(section).model_fields.items()
+    known = [name.upper() for name, field in fields if field.validation_alias is None]
+    problems = []
+    for variable in sorted(environment):
+        name = variable.upper().partition("__")[0]
+        # Some sections begin with the name of another one.
+        nearest = max((one for one in prefixes if name.startswith(one)), key=len, default="")
+        setting = name.removeprefix(nearest)
+        if nearest == own and setting not in known:
+            meant = get_close_matches(setting, known, n=1, cutoff=0.75)
+            hint = f"see dextouch config show {section}"
+            if meant:
+                hint = f"did you mean {own}{meant[0]}?"
+            problems.append(f"{variable} sets nothing: there is no such setting; {hint}")
+    return problems
 
 
 def effective_settings(section: str) -> list[Setting]:

@@ -157,8 +157,10 @@ class Machine:
     def _devices(self) -> list[Finding]:
         findings, dev = [], self.root / "dev"
         access = (
+            'sudo groupadd --force dextouch && sudo usermod -aG dextouch "$USER" && '
             f"sudo install -m 644 {self.rules} /etc/udev/rules.d/ && "
-            "sudo udevadm control --reload && sudo udevadm trigger"
+            "sudo udevadm control --reload && sudo udevadm trigger  "
+            "# the rules need your serial numbers; log in again for the group"
         )
         for kind, patterns in DEVICE_KINDS.items():
             paths = sorted(path for pattern in patterns for path in dev.glob(pattern))

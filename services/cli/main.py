@@ -90,7 +90,21 @@ def run_command(words: Sequence[str]) -> int:
         return 0
     if command.flags and not {"-h", "--help"}.isdisjoint(arguments):
         _show_help(command.flags, arguments)
+    _warn_of_unknown_variables(name, command.flags, arguments)
     return _found(command.target)(arguments) or 0
+
+
+def _warn_of_unknown_variables(name: str, section: str, arguments: list[str]) -> None:
+    # A warning, since some platforms set variables of such names themselves.
+    if any(variable.startswith("DEXTOUCH_") for variable in os.environ):
+        from dextouch.serving import section_of
+        from services.cli.configuration import SECTIONS, unknown_variables
+
+        if section.endswith("_settings"):
+            section = section_of(_found(section)(arguments))
+        if section in SECTIONS:
+            for problem in unknown_variables(section, os.environ):
+                print(f"dextouch {name}: warning: {printable(problem)}", file=sys.stderr)
 
 
 def _found(place: str) -> Any:  # noqa: ANN401 - functions and classes

@@ -24,20 +24,11 @@ from markupsafe import Markup
 from pydantic import Field, ValidationError
 from starlette.requests import HTTPConnection
 
+from dextouch import serving
 from dextouch.errors import AccessDeniedError, InvalidInputError, NotFoundError
 from dextouch.free_text import FreeText
 from dextouch.frozen_model import FrozenModel
 from dextouch.schemas import first_problems
-from dextouch.serving import (
-    FORM,
-    KIB,
-    AccessControl,
-    Grant,
-    not_signed_in,
-    page_headers,
-    secret_digest,
-    takes,
-)
 from services.dashboard.settings import DashboardSettings
 from services.dashboard.upstream import SCOPE
 
@@ -186,7 +177,7 @@ class Sessions:
     """Access of browsers: open on loopback without keys, otherwise by signing in."""
 
     # Of the application, which is made later.
-    access: AccessControl = field(init=False)
+    access: serving.AccessControl = field(init=False)
     _: KW_ONLY
     needs_key: bool
     lifetime_s: float
@@ -212,7 +203,7 @@ class Sessions:
         while len(self._open) >= MAX_SESSIONS:
             self._open.pop(next(iter(self._open)))
         token = secrets.token_urlsafe(32)
-        self._open[token] = secret_digest(key.strip()), now_s + self.lifetime_s
+        self._open[token] = serving.secret_digest(key.strip()), now_s + self.lifetime_s
         return token
 
     def sign_out(self, connection: HTTPConnection) -> None:
@@ -232,7 +223,7 @@ class Sessions:
         grant = self._grant(token)
         return None if grant is None else grant.name
 
-    def _grant(self, token: str) -> Grant | None:
+    def _grant(self, token: str) -> serving.Grant | None:
         digest, end_s = self._open.get(token, (b"", 0.0))
         # A key that the settings no longer have takes its sessions along.
         return self.access.of_digest(digest) if end_s > self.clock_s() else None
@@ -240,7 +231,7 @@ class Sessions:
     def guard(self, connection: HTTPConnection) -> None:
         """Refuse browsers that are not signed in."""
         if not self.allows(connection):
-            raise not_signed_in()
+            raise serving.not_signed_in()
 
     def require(self, connection: HTTPConnection, scope: str) -> None:
         """Refuse browsers that signed in with a key without this scope."""
@@ -261,7 +252,7 @@ def page_router(settings: DashboardSettings, sessions: Sessions) -> APIRouter:
         router.add_api_route(screen.path, show, methods=["GET"])
 
     @router.post("/sign_in")
-    @takes({FORM: 4 * KIB}, needs_key=False)
+    @serving.takes({serving.FORM: 4 * serving.KIB}, needs_key=False)
     async def sign_in(request: Request) -> Response:
         fields = parse_qs((await request.body()).decode("utf-8", "replace"))
         wanted = _own_path(fields.get("wanted", ["/"])[0])
@@ -290,7 +281,7 @@ def page_router(settings: DashboardSettings, sessions: Sessions) -> APIRouter:
         return entered
 
     @router.post("/sign_out")
-    @takes({FORM: KIB}, needs_key=False)
+    @serving.takes({serving.FORM: serving.KIB}, needs_key=False)
     async def sign_out(request: Request) -> Response:
         sessions.sign_out(request)
         answer = RedirectResponse("/", 303)
@@ -363,7 +354,7 @@ def refusal_page(station: str, reason: str, status: int) -> Response:
 
 def _page(station: str, name: str, code: int = 200, **values: object) -> HTMLResponse:
     text = TEMPLATES.get_template(name).render(station=station, **values)
-    return HTMLResponse(text, code, headers=page_headers(forms="'self'"))
+    return HTMLResponse(text, code, headers=serving.page_headers(forms="'self'"))
 
 
 def find_documents() -> Path:

@@ -100,12 +100,11 @@ class RolloutFeeds:
             )
         found = await asyncio.gather(*(self._of_service(name) for name in names))
         rollouts = sorted((one for view in found for one in view.rollouts), key=lambda o: o.age_s)
+        over = sorted((one for view in found for one in view.over), key=lambda o: o.idle_s)
         return RolloutsView(
             worlds=tuple(world for view in found for world in view.worlds),
             rollouts=tuple(rollouts),
-            over=tuple(
-                sorted((one for view in found for one in view.over), key=_idle_s)[:NUM_OVER]
-            ),
+            over=tuple(over[:NUM_OVER]),
             num_open=sum(view.num_open for view in found),
             has_episodes=self._feeds.has("episode_store"),
             problems=tuple(text for view in found for text in view.problems),
@@ -147,10 +146,6 @@ class RolloutFeeds:
             over=shown_of(listed.over),
             num_open=listed.num_open,
         )
-
-
-def _idle_s(rollout: ListedRollout) -> float:
-    return rollout.idle_s
 
 
 class _Watched:

@@ -6,28 +6,14 @@ from urllib.parse import quote
 
 from pydantic import Field
 
+from dextouch import schemas
 from dextouch.errors import AccessDeniedError, DexTouchError, NotFoundError
 from dextouch.frozen_model import FrozenModel, is_none
-from dextouch.schemas import (
-    DeviceHealth,
-    HealthCause,
-    HealthLevel,
-    Problem,
-    RecorderSession,
-    RecorderStatus,
-    RobotFollowing,
-    SimulatedFault,
-    StationHealth,
-    StreamHealth,
-    TakePrompt,
-    TaxelState,
-    UploadStatus,
-)
 from dextouch.tactile import LayoutDescription
 from services.dashboard.upstream import Upstream
 
 # From harmless to grave: an ERROR of one stream outranks the silence of another.
-LEVELS: tuple[HealthLevel, ...] = ("OK", "WARN", "STALE", "ERROR")
+LEVELS: tuple[schemas.HealthLevel, ...] = ("OK", "WARN", "STALE", "ERROR")
 # Of the recorder's status, shown as it is.
 KEPT = {"state", "actions", "recording_id", "prompt", "session", "needs_consent"}
 # What the station finds of its computer.
@@ -42,7 +28,7 @@ class StreamView(FrozenModel):
 
     name: str
     device: str
-    level: HealthLevel
+    level: schemas.HealthLevel
     note: str
     rate_hz: float | None
     nominal_rate_hz: float
@@ -57,7 +43,7 @@ class CauseView(FrozenModel):
     """A root cause with its one advice; `findings` is what follows from it, a line a stream."""
 
     key: str
-    level: HealthLevel
+    level: schemas.HealthLevel
     message: str
     advice: str
     lasted_s: float | None
@@ -68,7 +54,7 @@ class CauseView(FrozenModel):
 class HostView(FrozenModel):
     """The station's computer; None where not measured."""
 
-    level: HealthLevel = "OK"
+    level: schemas.HealthLevel = "OK"
     cpu_percent: float | None = None
     wake_ms: float | None = None
     disk_free_gb: float | None = None
@@ -85,15 +71,15 @@ class RecorderView(FrozenModel):
     state: str
     actions: tuple[str, ...] = ()
     recording_id: str | None = None
-    prompt: TakePrompt | None = None
+    prompt: schemas.TakePrompt | None = None
     elapsed_s: float | None = None
-    level: HealthLevel = "OK"
+    level: schemas.HealthLevel = "OK"
     complete: bool = True
     cause: str = ""
     advice: str = ""
     problems: tuple[str, ...] = ()
     num_findings: int = 0
-    session: RecorderSession | None = None
+    session: schemas.RecorderSession | None = None
     needs_consent: bool = False
 
 
@@ -103,7 +89,7 @@ class GloveView(FrozenModel):
     `layout` is that of its taxels, None of `dextouch_v1`.
     """
 
-    taxels: dict[TaxelState, tuple[int, ...]]
+    taxels: dict[schemas.TaxelState, tuple[int, ...]]
     tare_age_s: float | None
     layout: LayoutDescription | None = Field(default=None, exclude_if=is_none)
 
@@ -112,17 +98,17 @@ class StationView(FrozenModel):
     """Overview of the station; by default of one that is not configured, for the reason `note`."""
 
     reachable: bool = False
-    level: HealthLevel = "STALE"
+    level: schemas.HealthLevel = "STALE"
     summary: str = ""
     note: str
-    note_level: HealthLevel = "ERROR"
+    note_level: schemas.HealthLevel = "ERROR"
     host: HostView | None = None
     causes: tuple[CauseView, ...] = ()
     streams: tuple[StreamView, ...] = ()
     recorder: RecorderView = RecorderView(state="unknown", level="ERROR")
     gloves: Mapping[str, GloveView] = {}
-    following: Mapping[str, RobotFollowing] = {}
-    faults: tuple[SimulatedFault, ...] | None = None
+    following: Mapping[str, schemas.RobotFollowing] = {}
+    faults: tuple[schemas.SimulatedFault, ...] | None = None
 
 
 def trouble(error: DexTouchError, address: str) -> tuple[str, str]:
@@ -154,7 +140,7 @@ def silent_view(error: DexTouchError, address: str) -> StationView:
     return StationView(summary="no answer", note="", causes=(cause,))
 
 
-def station_view(station: StationHealth, recorder: RecorderStatus) -> StationView:
+def station_view(station: schemas.StationHealth, recorder: schemas.RecorderStatus) -> StationView:
     """The station view of an acquisition service that responds."""
     devices = {device.device: device for device in station.devices}
     streams = tuple(_stream_view(item, devices.get(item.device)) for item in station.streams)
@@ -185,7 +171,7 @@ def station_view(station: StationHealth, recorder: RecorderStatus) -> StationVie
     )
 
 
-def recorder_view(recorder: RecorderStatus) -> RecorderView:
+def recorder_view(recorder: schemas.RecorderStatus) -> RecorderView:
     """The recorder view, with the findings of a take's check among the recorder's problems."""
     check = recorder.check
     # ERROR sorts before WARN. The recorder repeats what the check found: each is listed once.
@@ -200,7 +186,7 @@ def recorder_view(recorder: RecorderStatus) -> RecorderView:
     problems = (*dict.fromkeys(own), *(f"{s}: {' · '.join(texts)}" for s, texts in lines.items()))
     complete = check is None or check.complete
     cause = check.cause if check else None
-    level: HealthLevel = "WARN" if complete else "ERROR"
+    level: schemas.HealthLevel = "WARN" if complete else "ERROR"
     return RecorderView(
         **recorder.model_dump(include=KEPT),
         elapsed_s=recorder.duration_s,
@@ -213,11 +199,11 @@ def recorder_view(recorder: RecorderStatus) -> RecorderView:
     )
 
 
-def _worst(levels: Sequence[HealthLevel]) -> HealthLevel:
+def _worst(levels: Sequence[schemas.HealthLevel]) -> schemas.HealthLevel:
     return max(levels, key=LEVELS.index, default="OK")
 
 
-def _stream_view(item: StreamHealth, device: DeviceHealth | None) -> StreamView:
+def _stream_view(item: schemas.StreamHealth, device: schemas.DeviceHealth | None) -> StreamView:
     words = []
     if device is not None:
         words += [f"{device.reconnects} reconnects"] * bool(device.reconnects)
@@ -235,7 +221,7 @@ def _stream_view(item: StreamHealth, device: DeviceHealth | None) -> StreamView:
     )
 
 
-def _cause_view(cause: HealthCause, station: StationHealth) -> CauseView:
+def _cause_view(cause: schemas.HealthCause, station: schemas.StationHealth) -> CauseView:
     found = [
         (stream.stream, finding.message)
         for stream in station.streams
@@ -254,7 +240,7 @@ def _cause_view(cause: HealthCause, station: StationHealth) -> CauseView:
     )
 
 
-def _host_view(station: StationHealth) -> HostView:
+def _host_view(station: schemas.StationHealth) -> HostView:
     figures = station.figures
     levels = [
         *(cause.level for cause in station.causes if cause.code == "host"),
@@ -296,7 +282,7 @@ class TakeStateView(FrozenModel):
     recording_id: str
     player: str = ""
     stage: Stage
-    level: HealthLevel = "OK"
+    level: schemas.HealthLevel = "OK"
     reason: str = ""
 
 
@@ -317,7 +303,7 @@ class _Job(FrozenModel):
     state: Literal["waiting", "running", "done", "failed", "cancelled"]
     progress: float
     report: _Report | None = None
-    problem: Problem | None = None
+    problem: schemas.Problem | None = None
 
 
 class _Jobs(FrozenModel):
@@ -326,14 +312,14 @@ class _Jobs(FrozenModel):
 
 async def last_take(acquisition: Upstream, alignment: Upstream | None) -> TakeStateView | None:
     """State of the newest take that was saved at the station; None before the first one."""
-    session = (await acquisition.read(RecorderStatus, "/v1/recorder")).session
+    session = (await acquisition.read(schemas.RecorderStatus, "/v1/recorder")).session
     if session is None or session.last_saved is None:
         return None
     view = await _last_state(session.last_saved, acquisition, alignment)
     if not session.last_incomplete:
         return view
     reason = " · ".join(filter(None, (f"incomplete: {session.last_incomplete}", view.reason)))
-    level: HealthLevel = "WARN" if view.level == "OK" else view.level
+    level: schemas.HealthLevel = "WARN" if view.level == "OK" else view.level
     return view.model_copy(update={"level": level, "reason": reason})
 
 
@@ -341,10 +327,12 @@ async def _last_state(
     recording_id: str, acquisition: Upstream, alignment: Upstream | None
 ) -> TakeStateView:
     try:
-        upload = await acquisition.read(UploadStatus, f"/v1/uploads/{quote(recording_id, safe='')}")
+        upload = await acquisition.read(
+            schemas.UploadStatus, f"/v1/uploads/{quote(recording_id, safe='')}"
+        )
     except NotFoundError:
         # Stations that do not keep uploaded takes have removed it.
-        upload = UploadStatus(recording_id=recording_id, uploaded=True)
+        upload = schemas.UploadStatus(recording_id=recording_id, uploaded=True)
     if upload.refused:
         return _view(recording_id, "refused", "ERROR", upload.error or "")
     if not upload.uploaded:
@@ -378,7 +366,7 @@ async def _aligned(recording_id: str, stored_as: str, alignment: Upstream | None
     return _view(recording_id, "failed", "ERROR", reason or "no reason given")
 
 
-def _reported(report: _Report | None) -> tuple[HealthLevel, str]:
+def _reported(report: _Report | None) -> tuple[schemas.HealthLevel, str]:
     if report is None:
         return "OK", ""
     words = f"{report.duration_s:.1f} s, {report.num_steps} steps"
@@ -395,6 +383,6 @@ def _reported(report: _Report | None) -> tuple[HealthLevel, str]:
 
 
 def _view(
-    recording_id: str, stage: Stage, level: HealthLevel = "OK", reason: str = ""
+    recording_id: str, stage: Stage, level: schemas.HealthLevel = "OK", reason: str = ""
 ) -> TakeStateView:
     return TakeStateView(recording_id=recording_id, stage=stage, level=level, reason=reason)

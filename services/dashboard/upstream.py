@@ -147,7 +147,7 @@ class Upstream:
                 f"{self.name}: {method} {path} answered {response.status_code} without a reason",
                 service=self.name,
             ) from error
-        raise error_from_problem(problem)
+        raise error_from_problem(problem, self.name)
 
     async def answer(self, path: str) -> httpx.Response:
         """Any response to a GET request, also a refusal.

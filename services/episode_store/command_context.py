@@ -75,14 +75,6 @@ class Context:
         return self.root
 
 
-def existing_store(url: str) -> EpisodeStore:
-    """The store at a URL; raises NotFoundError without its folder, as where none is mounted."""
-    store = EpisodeStore(url)
-    if store.folders and not store.root.is_dir():
-        raise NotFoundError(f"store {store.root}: no such folder; mount it, or name another one")
-    return store
-
-
 def table(rows: list[tuple[str, ...]]) -> list[str]:
     """Format rows of text as lines with aligned columns."""
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))] if rows else []

@@ -26,7 +26,7 @@ from dextouch.errors import InvalidInputError, NotFoundError
 from dextouch.schemas import EpisodeAttributes, RecordingAttributes, json_ready
 from dextouch.serving import configure_logging
 from services.episode_store.catalog import Catalog, ListedRow
-from services.episode_store.command_context import Context, Outcome, existing_store, table
+from services.episode_store.command_context import Context, Outcome, table
 from services.episode_store.filters import EpisodeFilter
 from services.episode_store.parser import store_parser
 
@@ -45,7 +45,7 @@ def main(argv: Sequence[str]) -> int:
     url = options.store or _configured_url()
     run = _COMMANDS.get(options.command) or _editing_command(options.command)
     is_new = options.command in _MAY_CREATE
-    store = EpisodeStore(url) if is_new else existing_store(url)
+    store = EpisodeStore(url) if is_new else EpisodeStore(url).require_folder()
     result, status = run(Context(store, url, options))
     write_result(options.json, result)
     return status
@@ -358,7 +358,7 @@ def purge(context: Context) -> Outcome:
 def repair(context: Context) -> Outcome:
     """Repair damaged items from a copy, and salvage the rest."""
     root, options = context.need_local_root(), context.options
-    copies = existing_store(options.source) if options.source else None
+    copies = EpisodeStore(options.source).require_folder() if options.source else None
     reports = [] if options.ids else maintenance.repair_uploads(root)
     for kind, name in context.items():
         reports.append(maintenance.repair_group(root, kind, name, copy=_copy(copies, kind, name)))

@@ -14,7 +14,7 @@ from dextouch.episodes import EpisodeReader, EpisodeStore, Kind, editing
 from dextouch.errors import DexTouchError, InvalidInputError
 from dextouch.geometry import transform_from_pose
 from dextouch.schemas import EditedItem, NewNote, first_problems, json_ready
-from services.episode_store.command_context import Context, Outcome, existing_store, table
+from services.episode_store.command_context import Context, Outcome, table
 
 EXIT_REFUSED = 1
 
@@ -104,7 +104,7 @@ def _say_edit(context: Context, result: EditedItem) -> None:
 def merge(context: Context) -> Outcome:
     """Copy all items of stores into one."""
     options = context.options
-    sources = [existing_store(url) for url in options.sources]
+    sources = [EpisodeStore(url).require_folder() for url in options.sources]
 
     def show(report: editing.MergeReport) -> None:
         renamed = f"as {report.new_id}" if report.new_id not in {"", report.item_id} else ""

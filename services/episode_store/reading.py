@@ -11,29 +11,12 @@ from fastapi import APIRouter, Header, Query, Response
 from jaxtyping import Float64
 from pydantic import AfterValidator, BaseModel, Field
 
-from dextouch.episodes import (
-    EpisodeReader,
-    EpisodeStore,
-    ImageForm,
-    RecordingReader,
-    encode_window,
-    interpolated_spans,
-    measured_taxels,
-)
+from dextouch import episodes, schemas
 from dextouch.errors import InvalidInputError, LimitExceededError
 from dextouch.frozen_model import FrozenModel
 from dextouch.hands.actions import ACTION_DIM, action_names, poses_from_actions
 from dextouch.hands.robot_hand import RobotHand
 from dextouch.images import encode_jpeg
-from dextouch.schemas import (
-    ActionKind,
-    EpisodeDetail,
-    InterpolatedSpan,
-    ItemKind,
-    Playback,
-    PlayedStream,
-    RecordingAttributes,
-)
 from dextouch.serving import MSGPACK
 from dextouch.streams import JPEG_UNIT, StreamDescriptor, pack
 from dextouch.tactile.layout import SIDES
@@ -47,14 +30,14 @@ WINDOW_MSGPACK = "application/vnd.dextouch.window+msgpack"
 # Committed content is immutable but may be deleted: clients must revalidate.
 CACHE_CONTROL = "private, no-cache"
 IfNoneMatch = Annotated[str | None, Header(alias="if-none-match")]
-STREAMS: dict[ActionKind, str] = {"measured": "action", "commanded": "action_commanded"}
+STREAMS: dict[schemas.ActionKind, str] = {"measured": "action", "commanded": "action_commanded"}
 MAX_STEPS = 10_000
 GAP_PERIODS = 1.5
 MAX_GAPS = 50
 MAX_IMAGES = 240
 QUALITY = 85
 TOUCH_STREAMS = tuple(f"tactile_{side}" for side in SIDES)
-Reader = EpisodeReader | RecordingReader
+Reader = episodes.EpisodeReader | episodes.RecordingReader
 # Limits of one request: signals, and bytes of samples that are read for it.
 MAX_SIGNALS = 16
 MAX_READ_BYTES = 256 * 2**20
@@ -77,7 +60,7 @@ class WindowQuery(FrozenModel):
     start: int = Field(ge=0)
     num_steps: int = Field(default=17, ge=1)
     cameras: str = "camera_head"
-    action_kind: ActionKind = "measured"
+    action_kind: schemas.ActionKind = "measured"
     half_size: bool = False
     gray: bool = False
 
@@ -92,13 +75,13 @@ class SpanQuery(FrozenModel):
 Span = Annotated[SpanQuery, Query()]
 
 
-def content_router(store: EpisodeStore, settings: EpisodeStoreSettings) -> APIRouter:
+def content_router(store: episodes.EpisodeStore, settings: EpisodeStoreSettings) -> APIRouter:
     """Create the routes of single recordings and episodes; sizes are checked before reading."""
     router = APIRouter(prefix="/v1", dependencies=[MAY_READ])
     max_steps, max_bytes = settings.max_window_steps, settings.max_answer_bytes
 
     @router.get("/recordings/{recording_id}/attributes", tags=["recordings"])
-    def get_recording_attributes(recording_id: str) -> RecordingAttributes:
+    def get_recording_attributes(recording_id: str) -> schemas.RecordingAttributes:
         """Attributes of a finished recording."""
         return store.recording(recording_id).attributes
 
@@ -114,10 +97,10 @@ def content_router(store: EpisodeStore, settings: EpisodeStoreSettings) -> APIRo
         return response(etag_of(reader, stream, span), known, read)
 
     @router.get("/episodes/{episode_id}", tags=["episodes"])
-    def get_episode(episode_id: str) -> EpisodeDetail:
+    def get_episode(episode_id: str) -> schemas.EpisodeDetail:
         """Attributes of an episode."""
         reader = store.open(episode_id)
-        return EpisodeDetail(
+        return schemas.EpisodeDetail(
             attributes=reader.attributes,
             num_steps=reader.num_steps,
             content_sha256=reader.content_sha256,
@@ -156,9 +139,9 @@ def response(
     return Response(read(), media_type=media_type, headers=headers)
 
 
-def _window(reader: EpisodeReader, query: WindowQuery, max_bytes: int) -> bytes:
+def _window(reader: episodes.EpisodeReader, query: WindowQuery, max_bytes: int) -> bytes:
     cameras = tuple(name for name in query.cameras.split(",") if name)
-    form = ImageForm(half_size=query.half_size, gray=query.gray)
+    form = episodes.ImageForm(half_size=query.half_size, gray=query.gray)
     # An unknown camera is refused by the reader.
     known_cameras = [reader.streams[name] for name in cameras if name in reader.streams]
     step_bytes = sum(
@@ -173,7 +156,7 @@ def _window(reader: EpisodeReader, query: WindowQuery, max_bytes: int) -> bytes:
     window = reader.window(
         query.start, query.num_steps, cameras=cameras, action_kind=query.action_kind, form=form
     )
-    return encode_window(window)
+    return episodes.encode_window(window)
 
 
 def _samples(reader: Reader, stream: str, span: SpanQuery, max_bytes: int) -> bytes:
@@ -213,10 +196,10 @@ class RobotHandsQuery(FrozenModel):
 
     start_ns: int
     stop_ns: int
-    action_kind: ActionKind = "measured"
+    action_kind: schemas.ActionKind = "measured"
 
 
-def robot_hands(reader: EpisodeReader, query: RobotHandsQuery) -> bytes:
+def robot_hands(reader: episodes.EpisodeReader, query: RobotHandsQuery) -> bytes:
     """Both robot hands of the actions in a span, by forward kinematics, as msgpack.
 
     Arrays: `t_ns` [n]; for each side `SIDE_points_world_m` [n, 5, 4, 3], knuckle, PIP, DIP and tip
@@ -244,12 +227,12 @@ def robot_hands(reader: EpisodeReader, query: RobotHandsQuery) -> bytes:
     return pack({"action_kind": query.action_kind}, _points(reader, read.t_ref_ns, read.values))
 
 
-def _is_of_human_hand(reader: EpisodeReader) -> bool:
+def _is_of_human_hand(reader: episodes.EpisodeReader) -> bool:
     return (reader.attributes.domain, reader.attributes.origin) == ("human", "twin")
 
 
 def _points(
-    reader: EpisodeReader, t_ref_ns: np.ndarray, actions: np.ndarray
+    reader: episodes.EpisodeReader, t_ref_ns: np.ndarray, actions: np.ndarray
 ) -> dict[str, np.ndarray]:
     arrays: dict[str, Any] = {"t_ns": t_ref_ns}
     if not len(t_ref_ns):
@@ -296,18 +279,18 @@ class SignalsQuery(FrozenModel):
 Signals = Annotated[SignalsQuery, Query()]
 
 
-def playback_router(store: EpisodeStore, settings: EpisodeStoreSettings) -> APIRouter:
+def playback_router(store: episodes.EpisodeStore, settings: EpisodeStoreSettings) -> APIRouter:
     """Create the routes below /v1/playback; sizes are checked before reading."""
     router = APIRouter(prefix="/v1/playback", dependencies=[MAY_READ], tags=["playback"])
 
     @router.get("/{kind}/{item_id}")
-    def get_playback(kind: ItemKind, item_id: str) -> Playback:
+    def get_playback(kind: schemas.ItemKind, item_id: str) -> schemas.Playback:
         """What can be played of an item: its streams with their extents and longest gaps."""
         return playback_of(store.open_item(kind, item_id))
 
     @router.get("/{kind}/{item_id}/images/{camera}", **_answers(MSGPACK))
     def get_playback_images(
-        kind: ItemKind, item_id: str, camera: str, query: Images, known: IfNoneMatch = None
+        kind: schemas.ItemKind, item_id: str, camera: str, query: Images, known: IfNoneMatch = None
     ) -> Response:
         """JPEG images of a span: arrays `t_ns`, `num_bytes` of each, and `data`, one by one."""
         reader = store.open_item(kind, item_id)
@@ -316,7 +299,7 @@ def playback_router(store: EpisodeStore, settings: EpisodeStoreSettings) -> APIR
 
     @router.get("/{kind}/{item_id}/signals", **_answers(MSGPACK))
     def get_playback_signals(
-        kind: ItemKind, item_id: str, query: Signals, known: IfNoneMatch = None
+        kind: schemas.ItemKind, item_id: str, query: Signals, known: IfNoneMatch = None
     ) -> Response:
         """Lowest and highest value per bin of time: arrays `NAME/low`, `NAME/high` [points]."""
         reader = store.open_item(kind, item_id)
@@ -336,7 +319,7 @@ def playback_router(store: EpisodeStore, settings: EpisodeStoreSettings) -> APIR
     return router
 
 
-def playback_of(reader: Reader) -> Playback:
+def playback_of(reader: Reader) -> schemas.Playback:
     """Facts about an item for a player; reads the stamps of every stream."""
     streams = tuple(_played(reader, stream) for stream in reader.streams.values())
     firsts = [stream.first_ns for stream in streams if stream.first_ns is not None]
@@ -345,7 +328,7 @@ def playback_of(reader: Reader) -> Playback:
     names = ("task", "instruction", "domain", "station", "operator", "success", "recovered")
     shared = {name: getattr(about, name) for name in (*names, "lineage")}
     span = {"start_ns": min(firsts, default=0), "stop_ns": max(lasts, default=0)}
-    if isinstance(reader, EpisodeReader):
+    if isinstance(reader, episodes.EpisodeReader):
         of_episode = reader.attributes
         origin_ns = of_episode.quality.get("origin_after_start_ns")
         own = {
@@ -358,27 +341,29 @@ def playback_of(reader: Reader) -> Playback:
     else:
         own = {"kind": "recording", "origin": "recorded", "at": reader.attributes.started_at}
         own["started_t_host_ns"] = reader.attributes.started_t_host_ns
-    return Playback.model_validate(shared | span | own | {"id": reader.item_id, "streams": streams})
+    return schemas.Playback.model_validate(
+        shared | span | own | {"id": reader.item_id, "streams": streams}
+    )
 
 
-def _played(reader: Reader, stream: StreamDescriptor) -> PlayedStream:
+def _played(reader: Reader, stream: StreamDescriptor) -> schemas.PlayedStream:
     stamps_ns = reader.stamps_ns(stream.name)
     steps_ns = np.diff(stamps_ns)
     gaps = np.flatnonzero(steps_ns > GAP_PERIODS * stream.period_ns())
     longest = np.sort(gaps[np.argsort(steps_ns[gaps], kind="stable")[-MAX_GAPS:]])
     calibration, num_taxels = reader.attributes.calibration, stream.tactile_layout.num_taxels
-    spans = interpolated_spans(calibration) if stream.name.startswith("action") else []
+    spans = episodes.interpolated_spans(calibration) if stream.name.startswith("action") else []
     taxels = np.zeros(0, dtype=np.int64)
     if stream.name in TOUCH_STREAMS:
-        measured = measured_taxels(calibration, num_taxels)
+        measured = episodes.measured_taxels(calibration, num_taxels)
         taxels = np.flatnonzero(~measured[TOUCH_STREAMS.index(stream.name)])
     is_action = stream.name in STREAMS.values() and stream.shape == (ACTION_DIM,)
     components = (
         action_names(has_robot_joints=not _is_of_human_hand(reader))
-        if is_action and isinstance(reader, EpisodeReader)
+        if is_action and isinstance(reader, episodes.EpisodeReader)
         else ()
     )
-    return PlayedStream(
+    return schemas.PlayedStream(
         name=stream.name,
         kind=stream.kind,
         shape=stream.shape,
@@ -392,7 +377,7 @@ def _played(reader: Reader, stream: StreamDescriptor) -> PlayedStream:
         num_gaps=len(gaps),
         gaps_ns=tuple((int(stamps_ns[k]), int(stamps_ns[k + 1])) for k in longest),
         interpolated=tuple(
-            InterpolatedSpan(part=part, start_ns=start_ns, stop_ns=stop_ns)
+            schemas.InterpolatedSpan(part=part, start_ns=start_ns, stop_ns=stop_ns)
             for part, start_ns, stop_ns in spans
         ),
         unmeasured_taxels=tuple(taxels.tolist()),
@@ -407,7 +392,7 @@ def _images(reader: Reader, camera: str, query: ImagesQuery, max_bytes: int) -> 
     if descriptor.kind != "image":
         raise InvalidInputError(f"images: {camera!r} is a stream of kind {descriptor.kind!r}")
     is_colour = len(descriptor.shape) == 3
-    form = ImageForm(half_size=query.half_size and is_colour)
+    form = episodes.ImageForm(half_size=query.half_size and is_colour)
     image_bytes = int(np.prod(form.shape(descriptor.shape)))
     allowed = max(1, min(MAX_IMAGES, max_bytes // image_bytes))
     text = f"the span holds {count} images, expected at most {allowed}; ask for a shorter time"

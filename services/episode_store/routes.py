@@ -85,7 +85,7 @@ def uploads_router(
         request: Request,
         sender: Writer,
     ) -> schemas.BatchReceipt:
-        """Store batch n of a stream (wire format v2 or v1), exactly once even if repeated."""
+        """Store batch n of a stream (wire format v2), exactly once even if repeated."""
         announced = request.headers.get("content-length", "")
         # A body of unknown length may be as large as the largest batch.
         num_bytes = int(announced) if announced.isdecimal() else MAX_BATCH_BYTES

@@ -9,7 +9,7 @@ from typing import Any
 
 from dextouch.clients import Policy, RolloutClient
 from dextouch.command_line import write_result
-from dextouch.episodes import EpisodeStore, select_episodes
+from dextouch.episodes import EpisodeStore, Split, select_episodes
 from dextouch.errors import InvalidInputError, UnknownNameError
 from dextouch.free_text import printable
 from dextouch.serving import load_settings
@@ -70,12 +70,12 @@ def run_train_judge(arguments: list[str]) -> int:
     """Train the success classifier and save it."""
     settings = load_settings(TrainJudgeSettings, arguments)
 
-    def read(urls: Sequence[str]) -> list[EndingEpisode]:
+    def read(urls: Sequence[str], splits: Sequence[Split] = settings.splits) -> list[EndingEpisode]:
         stores = [EpisodeStore(url) for url in urls]
         if not stores:
             return []
         return read_ending_episodes(
-            *stores, tasks=settings.tasks, splits=settings.splits, image_px=settings.image_px
+            *stores, tasks=settings.tasks, splits=splits, image_px=settings.image_px
         )
 
     if settings.base is not None:
@@ -98,7 +98,7 @@ def run_train_judge(arguments: list[str]) -> int:
         settings.training,
         command=command_line("judge", arguments),
         development=read(settings.development),
-        held_out=read(settings.held_out),
+        held_out=read(settings.held_out, ()),
         jobs=settings.jobs,
     )
     return keep(checkpoint, settings.output, settings.json_path)

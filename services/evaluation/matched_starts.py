@@ -3,6 +3,7 @@
 import hashlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float64
@@ -150,17 +151,25 @@ def start_digest(head_image: np.ndarray, tactile_kpa: np.ndarray) -> str:
     return digest.hexdigest()
 
 
-def refuse_training_starts(digests: Iterable[str], *, trained_on: Iterable[str], what: str) -> None:
-    """Refuse an evaluation whose starts have digests of starts that a network was trained on.
+def refuse_training_starts(
+    marks: Iterable[str],
+    *,
+    trained_on: Iterable[str],
+    what: str,
+    noun: Literal["starts", "scenes"] = "starts",
+) -> None:
+    """Refuse an evaluation on starts, or scenes, that a network was trained on.
 
-    Raises ConflictError if there are such starts; `what` is the network.
+    Raises ConflictError if there are any; `marks` and `trained_on` are digests of starts or names
+    of scenes, `what` is the network.
     """
-    shared = sorted(set(digests) & set(trained_on))
+    shared = sorted(set(marks) & set(trained_on))
     if shared:
+        first = shared[0] if noun == "scenes" else f"{shared[0][:12]}…"
         raise ConflictError(
-            f"evaluation: {len(shared)} starts were trained on by {what}, first {shared[0][:12]}…; "
-            "choose others, outside its training data",
-            starts=shared,
+            f"evaluation: {len(shared)} {noun} were trained on by {what}, first {first}; choose "
+            "others, outside its training data",
+            **{noun: shared},
         )
 
 

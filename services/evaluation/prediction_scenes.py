@@ -194,14 +194,17 @@ def read_rollout(reader: EpisodeReader) -> Scene:
 def read_windows(reader: EpisodeReader) -> list[Scene]:
     """An episode as consecutive scenes of one chunk, each from the true step before it.
 
-    Chunks with interpolated actions are left out.
+    Chunks with interpolated actions are left out, and those without an image before or of them.
     """
     grid = EpisodeGrid(reader)
+    shown = np.isin(np.arange(len(grid)), grid.image_steps)
     starts = range(0, len(grid) - CHUNK_STEPS, CHUNK_STEPS)
     return [
         _read(grid, start, CHUNK_STEPS, image_every=1)
         for start in starts
         if grid.is_measured(start, start + CHUNK_STEPS + 1)
+        and shown[start]
+        and shown[start + 1 : start + CHUNK_STEPS + 1].any()
     ]
 
 

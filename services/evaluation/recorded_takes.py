@@ -24,29 +24,21 @@ from dextouch.errors import InvalidInputError
 from dextouch.images import square_of_at_most
 from dextouch.schemas import WorldDescription
 from dextouch.streams import HEAD_CAMERA
+from services.evaluation import matched_starts
 from services.evaluation.closed_loop import RolloutRunner
-from services.evaluation.matched_starts import (
-    MatchedStart,
-    StudyWorlds,
-    WorldAddress,
-    check_judged_touch,
-    refuse_training_starts,
-    start_digest,
-)
 from services.evaluation.policies.open_loop import ReplayPolicy
 from services.evaluation.progress import Progress
 from services.evaluation.rendering import rendered
 from services.evaluation.scores import ClosedLoopReport, Outcome, RolloutFailure, RolloutScore
-from services.evaluation.statistics import area_under_roc, central_interval
+from services.evaluation.statistics import area_interval, area_under_roc
 from services.evaluation.success_classifier import SuccessClassifier
 from services.networks.training_settings import USUAL_IMAGE_PX
 
 IMAGINED: Final = "imagined"
 # What a take must have to be replayed.
-REPLAYED: Final = (needs.EVERY_PART, needs.WHOLE, needs.OUTCOME, needs.IMAGES)
+REPLAYED: Final = (needs.EVERY_PART, needs.WHOLE, needs.OUTCOME, needs.FIRST_IMAGE)
 # Name of the replayed actions among the policies.
 REPLAY: Final = "recorded actions"
-_DRAWS: Final = 1000
 # With fewer takes of either outcome, an area under the curve says little.
 LEAST_OF_EACH: Final = 5
 
@@ -56,7 +48,7 @@ class RecordedTake:
     """A take of known outcome: its first observation, and the actions of its later steps."""
 
     episode_id: str
-    start: MatchedStart
+    start: matched_starts.MatchedStart
     success: bool
     actions: Float64[np.ndarray, "steps 67"]
     model_rate_hz: float
@@ -69,15 +61,18 @@ def read_takes(
     splits: Collection[Split] = (),
     most: int | None = None,
     further_views: Sequence[str] = (),
+    chunk_multiple: int = 1,
 ) -> list[RecordedTake]:
     """Robot episodes of known outcome, whatever recorded them; imagined ones are left out.
 
-    Starts have the images of those `further_views` that a take has.
+    Starts have the images of those `further_views` that a take has. Takes without a chunk of
+    `chunk_multiple` steps after the first are left out.
 
     `tasks` and `splits` of scenes are empty for all; of each task the first `most` by their ids are
     read, None for all. Raises NotFoundError and ConflictError as `select_episodes`.
     """
-    readers = select_episodes(stores, domain="robot", tasks=tasks, splits=splits, needs=REPLAYED)
+    required = (*REPLAYED, needs.longer_than(chunk_multiple))
+    readers = select_episodes(stores, domain="robot", tasks=tasks, splits=splits, needs=required)
     takes: list[RecordedTake] = []
     counts: Counter[str] = Counter()
     for reader in readers:
@@ -90,7 +85,7 @@ def read_takes(
 
 def _read_take(reader: EpisodeReader, number: int, further_views: Sequence[str]) -> RecordedTake:
     grid, about = EpisodeGrid(reader), reader.attributes
-    start = MatchedStart(
+    start = matched_starts.MatchedStart(
         about.task,
         number,
         about.instruction,
@@ -131,8 +126,8 @@ class RecordedScores:
     def trust(self, task: str) -> dict[str, Any]:
         """How imagined verdicts of the recorded actions compare with their real outcomes.
 
-        `auc` is that of the probability of success, undecided rollouts included, with a bootstrap
-        interval over the takes; `wrong` is the share of wrong verdicts among the decided.
+        `auc` is that of the probability of success, undecided rollouts included, with its 95 %
+        interval (`area_interval`); `wrong` is the share of wrong verdicts among the decided.
         """
         scores = self.scores(REPLAY, task)
         real = np.array([self.takes[one.seed].success for one in scores])
@@ -148,7 +143,9 @@ class RecordedScores:
         if min(real.sum(), (~real).sum()) >= LEAST_OF_EACH:
             probability = np.array([one.probability for one in scores])
             figures["auc"] = area_under_roc(probability, real)
-            figures["auc_interval"] = _auc_interval(probability, real)
+            num_successes = int(real.sum())
+            interval = area_interval(figures["auc"], num_successes, len(real) - num_successes)
+            figures["auc_interval"] = [interval.low, interval.high]
         return figures
 
     def policy_row(self, policy: str, task: str) -> dict[str, Any]:
@@ -177,7 +174,7 @@ class RecordedScores:
 def score_recorded(
     takes: Sequence[RecordedTake],
     policies: Mapping[str, Policy],
-    world: WorldAddress,
+    world: matched_starts.WorldAddress,
     description: WorldDescription,
     probe: SuccessClassifier,
     *,
@@ -188,14 +185,13 @@ def score_recorded(
     Rollouts last as long as their takes, whole chunks of the world; a failed one is recorded as a
     failure, and the others continue. `trained_on` maps trained components, beside the judge, to
     digests of their training starts. Raises ConflictError for a take that was trained on, and
-    InvalidInputError for a task, touch, images, a rate or a length that the world or the judge do
-    not know.
+    InvalidInputError for a task, touch, images or a rate that the world or the judge do not know.
     """
     digests = [digest for take in takes for digest in _digests(take.start)]
     judged = {"the success classifier": probe.metadata.training_starts}
     for what, trained in {**judged, **(trained_on or {})}.items():
-        refuse_training_starts(digests, trained_on=trained, what=what)
-    check_judged_touch({description.name: description})
+        matched_starts.refuse_training_starts(digests, trained_on=trained, what=what)
+    matched_starts.check_judged_touch({description.name: description})
     multiple = description.chunk_multiple
     for take in takes:
         description.check_rate(take.model_rate_hz, of=f"take {take.episode_id!r}")
@@ -207,11 +203,6 @@ def score_recorded(
                 f"({', '.join(probe.metadata.settings['instructions'])}); train both on it, or "
                 "choose --tasks"
             )
-        if len(take.actions) < multiple:
-            raise InvalidInputError(
-                f"take {take.episode_id!r}: has {len(take.actions)} steps after the first, "
-                f"expected at least the {multiple} of a chunk"
-            )
     if description.image_height_px != probe.shape.image_size_px:
         raise InvalidInputError(
             f"world {description.name!r}: draws images of {description.image_height_px} px, the "
@@ -220,7 +211,7 @@ def score_recorded(
         )
     replay = ReplayPolicy({(take.start.task, take.start.seed): take.actions for take in takes})
     actors: dict[str, Policy] = {REPLAY: replay, **policies}
-    worlds = StudyWorlds({IMAGINED: world}, {IMAGINED: description})
+    worlds = matched_starts.StudyWorlds({IMAGINED: world}, {IMAGINED: description})
     outcomes: list[Outcome] = []
     with Progress("imagined rollouts", len(takes) * len(actors)) as progress:
         for take in takes:
@@ -233,26 +224,12 @@ def score_recorded(
     return RecordedScores(tuple(takes), tuple(outcomes), tuple(policies))
 
 
-def _digests(start: MatchedStart) -> tuple[str, ...]:
+def _digests(start: matched_starts.MatchedStart) -> tuple[str, ...]:
     """Digests of a start: as recorded, and with the image and touch that worlds make of it."""
     touch = start.observation.tactile_kpa[0]
     images = start.observation.images[HEAD_CAMERA]
     small = square_of_at_most(images, start.K_head, USUAL_IMAGE_PX)[0][0]
-    return start.digest, start_digest(small, np.maximum(touch, 0.0))
-
-
-def _auc_interval(probability: np.ndarray, real: np.ndarray) -> list[float]:
-    """95 % bootstrap interval, with as many takes of each outcome in every draw."""
-    draw = np.random.default_rng(0)
-    good, bad = probability[real], probability[~real]
-    outcome = np.repeat([True, False], [len(good), len(bad)])
-    areas = [
-        area_under_roc(np.concatenate([draw.choice(good, len(good)), draw.choice(bad, len(bad))]),
-                       outcome)
-        for _ in range(_DRAWS)
-    ]  # fmt: skip
-    interval = central_interval(np.array(areas))
-    return [interval.low, interval.high]
+    return start.digest, matched_starts.start_digest(small, np.maximum(touch, 0.0))
 
 
 def score_lines(scores: RecordedScores) -> list[str]:

@@ -11,6 +11,10 @@ _LATEX: Final = {ord(letter): rf"\{letter}" for letter in "#$%&_{}"} | {
     ord("\\"): r"\textbackslash{}",
     ord("~"): r"\textasciitilde{}",
     ord("^"): r"\textasciicircum{}",
+    # In LaTeX's default encoding of fonts these are other characters.
+    ord("<"): r"\textless{}",
+    ord(">"): r"\textgreater{}",
+    ord("|"): r"\textbar{}",
 }
 
 

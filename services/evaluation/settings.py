@@ -12,19 +12,7 @@ from dextouch.data_folder import data_folder, default_store
 from dextouch.frozen_model import FrozenModel
 from dextouch.serving import CommandSettings, ServiceSettings, service_config
 from services.evaluation.bundled_policies import DEFAULT_POLICY, PRETRAINED, BundledName
-from services.networks.training_settings import (
-    USUAL_IMAGE_PX,
-    Batch,
-    CpuBudget,
-    ImagePx,
-    LearningRate,
-    NumSteps,
-    Splits,
-    Stores,
-    Tasks,
-    TrainingSettings,
-    WeightDecay,
-)
+from services.networks import training_settings
 
 EARLY_POLICY = PRETRAINED / "behaviour_cloning_early.safetensors"
 # Word of `--base` for the next.
@@ -43,26 +31,26 @@ _STUDY = "name of the study whose rollouts are rated; default: all rollouts of t
 _RUBRICS = "TOML file of rubrics by task; default: the package's"
 
 
-class CloningSettings(TrainingSettings):
+class CloningSettings(training_settings.TrainingSettings):
     """Training settings of behaviour cloning."""
 
-    num_training_steps: NumSteps = 3000
-    max_cpu_s: CpuBudget = 240.0
-    batch_size: Batch = 72
-    learning_rate: LearningRate = 1.5e-3
-    weight_decay: WeightDecay = 1e-3
+    num_training_steps: training_settings.NumSteps = 3000
+    max_cpu_s: training_settings.CpuBudget = 240.0
+    batch_size: training_settings.Batch = 72
+    learning_rate: training_settings.LearningRate = 1.5e-3
+    weight_decay: training_settings.WeightDecay = 1e-3
     held_out_share: float = Field(default=0.12, gt=0, lt=1, description="share of held-out seeds")
 
 
-class ClassifierSettings(TrainingSettings):
+class ClassifierSettings(training_settings.TrainingSettings):
     """Training settings of a success classifier."""
 
     # For each task.
-    num_training_steps: NumSteps = 2000
-    max_cpu_s: CpuBudget = 200.0
-    batch_size: Batch = Field(default=48, ge=2)
-    learning_rate: LearningRate = 1.5e-3
-    weight_decay: WeightDecay = 5e-2
+    num_training_steps: training_settings.NumSteps = 2000
+    max_cpu_s: training_settings.CpuBudget = 200.0
+    batch_size: training_settings.Batch = Field(default=48, ge=2)
+    learning_rate: training_settings.LearningRate = 1.5e-3
+    weight_decay: training_settings.WeightDecay = 5e-2
     development_share: float = Field(
         default=0.15, gt=0, lt=1, description="share of seeds to calibrate on"
     )
@@ -102,14 +90,14 @@ class TrainPolicySettings(CommandSettings):
 
     model_config = service_config("evaluation_train_policy", "dextouch train policy")
 
-    episodes: Stores
+    episodes: training_settings.Stores
     output: Path = Field(
         default=Path("runs/evaluation/behaviour_cloning.safetensors"),
         description="checkpoint to write",
     )
-    tasks: Tasks = ()
-    splits: Splits = ()
-    image_px: ImagePx = USUAL_IMAGE_PX
+    tasks: training_settings.Tasks = ()
+    splits: training_settings.Splits = ()
+    image_px: training_settings.ImagePx = training_settings.USUAL_IMAGE_PX
     places: Path | None = Field(
         default=None, description="state model whose start readers find the objects"
     )
@@ -140,7 +128,7 @@ class TrainJudgeSettings(CommandSettings):
 
     model_config = service_config("evaluation_train_probe", "dextouch train judge")
 
-    episodes: Stores
+    episodes: training_settings.Stores
     base: Path | None = Field(
         default=None,
         description="success classifier whose weights are kept, `package` for the package's: only "
@@ -150,14 +138,16 @@ class TrainJudgeSettings(CommandSettings):
         default=(), description="stores to calibrate on (default: a share of the scenes)"
     )
     held_out: tuple[str, ...] = Field(
-        default=(), description="stores to evaluate on (default: a fifth of the scenes)"
+        default=(),
+        description="stores to evaluate on (default: a fifth of the scenes); --splits does not "
+        "apply",
     )
     output: Path = Field(
         default=Path("runs/evaluation/success_probe.safetensors"), description="checkpoint to write"
     )
-    tasks: Tasks = ()
-    splits: Splits = ()
-    image_px: ImagePx = USUAL_IMAGE_PX
+    tasks: training_settings.Tasks = ()
+    splits: training_settings.Splits = ()
+    image_px: training_settings.ImagePx = training_settings.USUAL_IMAGE_PX
     jobs: int = Field(default=2, ge=1, le=64, description="tasks trained in parallel")
     training: ClassifierSettings = Field(
         default=ClassifierSettings(), description="training settings"

@@ -140,11 +140,16 @@ class ClassifierNetwork(nn.Module):
     def __init__(self, shape: ClassifierShape) -> None:
         super().__init__()
         self.num_outputs = shape.num_outputs
-        self.tasks = nn.ModuleDict({task: TaskNetwork(shape) for task in shape.tasks})
+        self.tasks = nn.ModuleDict({_module_name(task): TaskNetwork(shape) for task in shape.tasks})
+        if len(self.tasks) < len(shape.tasks):
+            raise InvalidInputError(
+                f"success classifier: of the tasks {', '.join(shape.tasks)} two have one name once "
+                "'.' is written '%2E'; relabel one of them"
+            )
 
     def of(self, task: str) -> TaskNetwork:
         """The network of one task."""
-        return cast("TaskNetwork", self.tasks[task])
+        return cast("TaskNetwork", self.tasks[_module_name(task)])
 
     def forward(self, batch: ClassifierBatch) -> Float32[torch.Tensor, "n outputs"]:
         """Log odds [n, outputs] of success and of the milestones of the task."""
@@ -155,6 +160,12 @@ class ClassifierNetwork(nn.Module):
                 mine = batch[rows]
                 odds[rows] = network(unit_images(mine.images), mine)
         return odds
+
+
+def _module_name(task: str) -> str:
+    """Name of a task's network: `nn.ModuleDict` refuses dots, and names of its own attributes."""
+    name = task.replace(".", "%2E")
+    return f"%{name}" if hasattr(nn.ModuleDict(), name) else name
 
 
 def unit_images(images: UInt8[torch.Tensor, "n 3 h w"]) -> Float32[torch.Tensor, "n 3 h w"]:

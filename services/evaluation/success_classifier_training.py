@@ -1,5 +1,6 @@
 """Training of the success classifier on true and imagined endings of known outcome."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -216,7 +217,8 @@ class ClassifierSets:
     ) -> "ClassifierSets":
         """The given sets; missing ones are taken from a share of the scenes of `episodes`.
 
-        Raises ConflictError if a held-out or development episode starts like a training episode.
+        Raises ConflictError if a held-out or development episode starts like a training episode, or
+        is of its scene: an imagined one starts from smaller images than its source.
         """
         training, tested, calibrated = list(episodes), list(held_out), list(development)
         if not tested:
@@ -226,11 +228,15 @@ class ClassifierSets:
                 training, held_out_share=settings.development_share, salt="development "
             )
         sets = cls(training, calibrated, tested)
-        learned = {e.start_digest for e in training}
-        for others, trained_on in ((calibrated, learned), (tested, sets.training_starts)):
-            digests = (e.start_digest for e in others)
-            what = "the success classifier"
-            refuse_training_starts(digests, trained_on=trained_on, what=what)
+        learned = [*training, *calibrated]
+        for others, trained_on in ((calibrated, training), (tested, learned)):
+            refuse = partial(refuse_training_starts, what="the success classifier")
+            refuse(
+                (e.start_digest for e in others), trained_on=(e.start_digest for e in trained_on)
+            )
+            refuse(
+                (e.scene for e in others), trained_on=(e.scene for e in trained_on), noun="scenes"
+            )
         return sets
 
     @property
@@ -271,6 +277,8 @@ def train_success_classifier(
     ConflictError if a held-out or development episode starts like a training episode, and
     InvalidInputError for a task with only one outcome.
     """
+    # As in each of several processes: sums over threads are rounded in another order.
+    torch.set_num_threads(1)
     torch.manual_seed(settings.seed)
     sets = ClassifierSets.split(episodes, settings, development=development, held_out=held_out)
     shape = ClassifierShape(
@@ -427,7 +435,7 @@ def _optimized(
         return _loss(odds, learned.outcome[index], learned.known[index])
 
     cpu_s = 0.0
-    for used in optimized(network, loss, settings, title=name, max_gradient_norm=None):
+    for used in optimized(network, loss, settings, title=name, max_gradient_norm=math.inf):
         cpu_s = used.cpu_s
     return network.state_dict(), cpu_s
 

@@ -11,14 +11,9 @@ from torch import Tensor, nn
 from dextouch.errors import InvalidInputError, LimitExceededError
 from dextouch.frozen_model import FrozenModel
 from services.evaluation.progress import Progress
+from services.networks import weight_files
 from services.networks.optimizer import Budget, OptimizerLoop, OptimizerOptions
 from services.networks.training_settings import TrainingSettings
-from services.networks.weight_files import (
-    load_strictly,
-    read_weights,
-    refuse_non_finite,
-    write_weights,
-)
 
 FORMAT_VERSION = 1
 MAX_CHECKPOINT_BYTES = 8 * 2**20  # chosen: twice what the largest of these networks has
@@ -58,13 +53,13 @@ def network_tensors(network: nn.Module, *, halved: Collection[str] = ()) -> dict
 
 def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
     """Write the file atomically; raises NonFiniteError, or LimitExceededError over 8 MiB."""
-    refuse_non_finite(checkpoint.tensors, "checkpoint")
+    weight_files.refuse_non_finite(checkpoint.tensors, "checkpoint")
     size = sum(t.numel() * t.element_size() for t in checkpoint.tensors.values())
     if size > MAX_CHECKPOINT_BYTES:
         raise LimitExceededError(
             f"checkpoint: {size} bytes of weights, expected at most {MAX_CHECKPOINT_BYTES}"
         )
-    write_weights(path, checkpoint.tensors, checkpoint.metadata, _METADATA_KEY)
+    weight_files.write_weights(path, checkpoint.tensors, checkpoint.metadata, _METADATA_KEY)
 
 
 def load_checkpoint(path: Path, *, kind: str | tuple[str, ...]) -> Checkpoint:
@@ -72,7 +67,7 @@ def load_checkpoint(path: Path, *, kind: str | tuple[str, ...]) -> Checkpoint:
 
     Raises as `read_weights`, and InvalidInputError for a checkpoint of another kind.
     """
-    tensors, metadata, _ = read_weights(
+    tensors, metadata, _ = weight_files.read_weights(
         path, CheckpointMetadata, _METADATA_KEY, max_bytes=2 * MAX_CHECKPOINT_BYTES
     )
     kinds = (kind,) if isinstance(kind, str) else kind
@@ -89,7 +84,7 @@ def load_network(network: nn.Module, checkpoint: Checkpoint) -> None:
     Raises InvalidInputError for missing or unexpected tensors, or wrong shapes.
     """
     where = f"checkpoint of {checkpoint.metadata.kind}"
-    load_strictly({_PREFIX: network}, checkpoint.tensors, where=where)
+    weight_files.load_strictly({_PREFIX: network}, checkpoint.tensors, where=where)
 
 
 def optimized(
@@ -98,7 +93,7 @@ def optimized(
     settings: TrainingSettings,
     *,
     title: str,
-    max_gradient_norm: float | None = 1.0,
+    max_gradient_norm: float = 1.0,
 ) -> Iterator[Budget]:
     """Train a network by losses of drawn batches; yields the used budget after each step."""
     generator = torch.Generator().manual_seed(settings.seed)

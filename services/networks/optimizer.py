@@ -27,12 +27,12 @@ class OptimizerOptions:
     """AdamW whose learning rate warms up linearly to its peak, scaled by a schedule.
 
     `schedule` maps the completed share of a run to a factor. Gradients longer than
-    `max_gradient_norm` are clipped; None neither clips nor checks them.
+    `max_gradient_norm` are clipped.
     """
 
     learning_rate: float
     weight_decay: float
-    max_gradient_norm: float | None = 1.0
+    max_gradient_norm: float = 1.0
     warmup_steps: int = 1
     schedule: Callable[[float], float] = half_cosine
     betas: tuple[float, float] = (0.9, 0.999)
@@ -133,18 +133,15 @@ class OptimizerLoop:
         """Take one step down the gradients that the weights have; errors show the losses."""
         for group in self.optimizer.param_groups:
             group["lr"] = self.options.rate(self.budget.step, self.budget.schedule_share())
-        if self.options.max_gradient_norm is not None:
-            norm = nn.utils.clip_grad_norm_(
-                self._network.parameters(), self.options.max_gradient_norm
+        weights, most = self._network.parameters(), self.options.max_gradient_norm
+        if not torch.isfinite(nn.utils.clip_grad_norm_(weights, most)):
+            values = ", ".join(f"{name} {one.item():.3g}" for name, one in losses.items())
+            raise NonFiniteError(
+                f"training: gradients of step {self.budget.step} of "
+                f"{type(self._network).__name__} are NaN or infinite ({values}), expected finite "
+                "ones; no weight was changed: look for NaN in the episodes, or lower the learning "
+                "rate"
             )
-            if not torch.isfinite(norm):
-                values = ", ".join(f"{name} {one.item():.3g}" for name, one in losses.items())
-                raise NonFiniteError(
-                    f"training: gradients of step {self.budget.step} of "
-                    f"{type(self._network).__name__} are NaN or infinite ({values}), expected "
-                    "finite ones; no weight was changed: look for NaN in the episodes, or lower "
-                    "the learning rate"
-                )
         self.optimizer.step()
 
 

@@ -14,12 +14,14 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 from torch.distributed.tensor import DTensor, distribute_tensor
 
+from dextouch.episodes import disk_errors
 from dextouch.errors import (
     CorruptDataError,
     InvalidInputError,
     LimitExceededError,
     NonFiniteError,
     NotFoundError,
+    StorageError,
     UnavailableError,
 )
 from dextouch.installation import install_command
@@ -54,18 +56,28 @@ def write_weights(path: Path, tensors: Mapping[str, Tensor], history: BaseModel,
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], notes: dict[str, str]) -> str:
-    """Write tensors with texts as metadata; as `write_weights`."""
-    path.parent.mkdir(parents=True, exist_ok=True)
+    """Write tensors with texts as metadata; as `write_weights`.
+
+    Raises StorageError if the file cannot be written.
+    """
     partial = path.with_name(path.name + ".partial")
-    # safetensors makes files that only their owner can read; these get the usual permissions.
-    partial.touch()
-    mode = partial.stat().st_mode
-    save_file({name: tensor.contiguous() for name, tensor in tensors.items()}, partial, notes)
-    partial.chmod(mode)
-    with partial.open("rb") as file:
-        os.fsync(file.fileno())
-    digest = digest_of(partial)
-    partial.replace(path)
+    with disk_errors(f"write {path}"):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        # safetensors makes files that only their owner can read; these get the usual permissions.
+        partial.touch()
+        mode = partial.stat().st_mode
+        try:
+            save_file({name: one.contiguous() for name, one in tensors.items()}, partial, notes)
+            partial.chmod(mode)
+            with partial.open("rb") as file:
+                os.fsync(file.fileno())
+            digest = digest_of(partial)
+            partial.replace(path)
+        except SafetensorError as error:
+            # Of the disk, which may be full: its text is all that safetensors passes on.
+            raise StorageError(f"write {path}: {error}; free space if the disk is full") from error
+        finally:
+            partial.unlink(missing_ok=True)
     return digest
 
 

@@ -45,6 +45,7 @@ from services.pipelines.study import refuse_trained
 from services.pipelines.twin_geometry import TwinGeometry
 from services.twin.settings import TwinSettings
 from services.twin.world import TwinWorld
+from services.world_model.shipped_checkpoints import default_checkpoint
 
 # Errors of both takes; the report shows the worse one.
 COMMON_ERRORS = ("taxel_mae_kpa", "fingertip_error_mm", "wrist_error_mm", "wrist_error_deg")
@@ -104,7 +105,7 @@ def run(plan: DemoPlan, folder: Path) -> dict[str, Any]:
         with stages.stage("train", "training world model, policy and probe"):
             models = scoring.train_models(plan.output / "trained")
     else:
-        models = scoring.committed_models()
+        models = scoring.Models.load(default_checkpoint())
     starts = range(
         FIRST_HELD_OUT_SEED, FIRST_HELD_OUT_SEED + max(plan.num_seeds, plan.num_predicted)
     )

@@ -23,7 +23,6 @@ from services.pipelines.study import demonstrator
 from services.twin.stage import ELSEWHERE, HOLD, RETREAT, script_name
 from services.twin.tasks import get_task
 from services.world_model.command_line import run_train
-from services.world_model.shipped_checkpoints import default_checkpoint
 from services.world_model.world import open_world
 
 MODEL = "world_model"
@@ -54,10 +53,17 @@ class Models:
     policy: BehaviourCloningPolicy
     probe: SuccessClassifier
 
-
-def committed_models() -> Models:
-    """Load the networks shipped with the package."""
-    return _load(default_checkpoint(), DEFAULT_POLICY, DEFAULT_PROBE)
+    @classmethod
+    def load(
+        cls, world_model: Path, policy: Path = DEFAULT_POLICY, probe: Path = DEFAULT_PROBE
+    ) -> "Models":
+        """Load the networks of files, policy and probe by default those of the package."""
+        return cls(
+            open_world(world_model),
+            world_model,
+            BehaviourCloningPolicy.load(policy),
+            SuccessClassifier.load(probe),
+        )
 
 
 def train_models(folder: Path) -> Models:
@@ -87,22 +93,13 @@ def train_models(folder: Path) -> Models:
     ]
     for step, words in steps:
         step(words)
-    return _load(world_model, policy, probe)
+    return Models.load(world_model, policy, probe)
 
 
 def _stores(*stores: str, to: Path | None = None) -> list[str]:
     """Flags that name the stores to read, and the file to write."""
     flags = [word for store in stores for word in ("--episodes", store)]
     return flags if to is None else [*flags, "--output", str(to)]
-
-
-def _load(world_model: Path, policy: Path, probe: Path) -> Models:
-    return Models(
-        open_world(world_model),
-        world_model,
-        BehaviourCloningPolicy.load(policy),
-        SuccessClassifier.load(probe),
-    )
 
 
 def ladder(plan: DemoPlan) -> dict[str, Policy]:

@@ -12,19 +12,11 @@ from dextouch.episodes import EpisodeReader, EpisodeStore, needs, select_episode
 from dextouch.errors import UnknownNameError
 from dextouch.schemas import CHUNK_STEPS
 from dextouch.serving import configure_logging
+from services.evaluation import prediction
 from services.evaluation.bundled_policies import bundled_policy, trained_policy, training_starts_of
 from services.evaluation.matched_starts import WorldAddress
 from services.evaluation.perceptual_networks import Metric
 from services.evaluation.policies.user_policies import load_policies
-from services.evaluation.prediction import (
-    ALL_TASKS,
-    GEOMETRY,
-    MODEL,
-    PredictionResult,
-    all_metrics,
-    described,
-    measure_prediction,
-)
 from services.evaluation.prediction_names import BASELINES
 from services.evaluation.prediction_scenes import Scene, read_rollout, read_windows
 from services.evaluation.recorded_takes import REPLAY, read_takes, score_lines, score_recorded
@@ -45,7 +37,7 @@ EXIT_FAILED = 1
 def prediction_main(arguments: Sequence[str]) -> int:
     """Run `dextouch evaluate prediction`."""
     options = prediction_parser().parse_args(list(arguments))
-    metrics = all_metrics(options.weights)
+    metrics = prediction.all_metrics(options.weights)
     chosen = options.metrics or tuple(metrics)
     for kind, names, known in (
         ("metric", chosen, metrics),
@@ -61,24 +53,26 @@ def prediction_main(arguments: Sequence[str]) -> int:
         [store],
         domain="robot",
         tasks=tasks,
-        needs=(needs.EVERY_PART, needs.IMAGES, needs.longer_than(CHUNK_STEPS)),
+        needs=(needs.EVERY_PART, needs.FIRST_IMAGE, needs.longer_than(CHUNK_STEPS)),
     )
     ids = [reader.item_id for reader in readers]
     refuse_trained_episodes(store, ids, path, command="evaluate prediction")
     result: dict[str, Any] = {"checkpoint": path.name, "digest": world.description.digest}
     measured = [metrics[name] for name in chosen]
-    result["metrics"] = described(measured)
+    result["metrics"] = prediction.described(measured)
     result["baselines"] = {name: BASELINES[name] for name in options.baselines}
     result["missing_baselines"] = {}
     for horizon in [options.horizon] if options.horizon else _HORIZONS:
         scenes = [scene for one in ids for scene in _HORIZONS[horizon](store.open(one))]
-        if set(chosen) & set(GEOMETRY):
+        if set(chosen) & set(prediction.GEOMETRY):
             # Replaying recorded takes, in this module, too, needs no twin.
             from services.pipelines.twin_geometry import TwinGeometry
 
             geometry = TwinGeometry()
             scenes = [geometry.added_to(one, store.open(one.episode_id)) for one in scenes]
-        found = measure_prediction(world, scenes, metrics=measured, baselines=options.baselines)
+        found = prediction.measure_prediction(
+            world, scenes, metrics=measured, baselines=options.baselines
+        )
         result[horizon] = dict(found.by_task)
         result[f"num_{horizon}"] = found.num_scenes
         result["missing_baselines"][horizon] = dict(found.missing)
@@ -88,12 +82,12 @@ def prediction_main(arguments: Sequence[str]) -> int:
     return 0
 
 
-def _prediction_table(found: PredictionResult, metrics: Mapping[str, Metric]) -> str:
+def _prediction_table(found: prediction.PredictionResult, metrics: Mapping[str, Metric]) -> str:
     """Figures of all tasks: a row for each metric, a column for the model and each baseline."""
-    figures = found.by_task[ALL_TASKS]
+    figures = found.by_task[prediction.ALL_TASKS]
     sources = list(figures)
     rows = [["", *sources]]
-    for name in figures[MODEL]:
+    for name in figures[prediction.MODEL]:
         metric = metrics[name]
         if metric.missing:
             continue
@@ -107,9 +101,11 @@ def _prediction_table(found: PredictionResult, metrics: Mapping[str, Metric]) ->
         "  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]) for row in rows
     ]
     about = [
-        f"{metrics[n].title}: {metrics[n].missing}" for n in figures[MODEL] if metrics[n].missing
+        f"{metrics[n].title}: {metrics[n].missing}"
+        for n in figures[prediction.MODEL]
+        if metrics[n].missing
     ]
-    about += [f"{name}: {BASELINES[name]}" for name in sources if name != MODEL]
+    about += [f"{name}: {BASELINES[name]}" for name in sources if name != prediction.MODEL]
     about += [f"{name} is missing: {reason}" for name, reason in found.missing.items()]
     return "\n".join([*lines, "", *about])
 
@@ -126,6 +122,7 @@ def recorded_main(arguments: Sequence[str]) -> int:
         splits=splits,
         most=options.count,
         further_views=world.description.optional_cameras,
+        chunk_multiple=world.description.chunk_multiple,
     )
     ids = {take.episode_id for take in takes}
     for store in stores:

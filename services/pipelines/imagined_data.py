@@ -62,9 +62,9 @@ def chosen_episodes(
         lambda reader: seeds is None or reader.attributes.seed in seeds,
         is_choice=True,
     )
-    episode_ids = (in_seeds, needs.EVERY_PART, needs.IMAGES, *also)
+    chosen = (in_seeds, needs.EVERY_PART, needs.FIRST_IMAGE, *also)
     readers = select_episodes(
-        [store], domain="robot", tasks=tasks or (), splits=splits, needs=episode_ids
+        [store], domain="robot", tasks=tasks or (), splits=splits, needs=chosen
     )
     return [reader.attributes for reader in readers]
 
@@ -213,7 +213,9 @@ def refuse_trained_episodes(
         trained = [
             one
             for one in episode_ids
-            if read_episode(store.open(one), image_px=px).fingerprint() in prints
+            # Without an image of nearly every step, nothing was trained on it.
+            if needs.EVERY_IMAGE.is_met(reader := store.open(one))
+            and read_episode(reader, image_px=px).fingerprint() in prints
         ]
     if trained:
         raise ConflictError(

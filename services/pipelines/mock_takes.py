@@ -230,7 +230,17 @@ def write_by_station(
     else:
         # The recording is not kept, and the wall clock would differ each time.
         attributes = attributes.model_copy(update={"created_at": None, "lineage": ()})
-    _write(store, attributes, streams, options)
+    written = streams
+    if options.streams == "training":
+        names = (*_TRAINED, *options.images, *map(object_stream, attributes.object_names))
+        written = [one for one in written if one.descriptor.name in names]
+    if options.image_every is not None:
+        grid_ns = next(one.t_ref_ns for one in streams if one.descriptor.name == "action")
+        written = [_thinned(one, grid_ns, options.image_every) for one in written]
+    with store.writer(kind="episode", attributes=attributes) as to:
+        for one in written:
+            to.add_stream(one.descriptor)
+            to.append(one.descriptor.name, values=one.values, t_ref_ns=one.t_ref_ns)
 
 
 def _aligned(
@@ -265,25 +275,6 @@ def _aligned(
         raise InvalidInputError(f"device takes: {episode_id} has no start time; record it again")
     origin_ns = origin_in_truth_ns(take, started_t_host_ns=started_ns, quality=attributes.quality)
     return attributes, streams, origin_ns
-
-
-def _write(
-    store: EpisodeStore,
-    attributes: EpisodeAttributes,
-    streams: Sequence[TruthStream],
-    options: TakeOptions,
-) -> None:
-    written = list(streams)
-    if options.streams == "training":
-        names = (*_TRAINED, *options.images, *map(object_stream, attributes.object_names))
-        written = [one for one in written if one.descriptor.name in names]
-    if options.image_every is not None:
-        grid_ns = next(one.t_ref_ns for one in streams if one.descriptor.name == "action")
-        written = [_thinned(one, grid_ns, options.image_every) for one in written]
-    with store.writer(kind="episode", attributes=attributes) as to:
-        for one in written:
-            to.add_stream(one.descriptor)
-            to.append(one.descriptor.name, values=one.values, t_ref_ns=one.t_ref_ns)
 
 
 @lru_cache(maxsize=4)

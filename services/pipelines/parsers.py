@@ -6,6 +6,7 @@ import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -79,19 +80,17 @@ def _moment(text: str) -> datetime:
         ) from error
 
 
-def _keywords(text: str) -> dict[str, Any]:
-    return _parsed(text, dict[str, Any], "a JSON object")
-
-
-def _keywords_by_name(text: str) -> dict[str, dict[str, Any]]:
-    return _parsed(text, dict[str, dict[str, Any]], "an object of objects")
-
-
-def _parsed(text: str, form: Any, expected: str) -> Any:  # noqa: ANN401 - of this form
+def _parsed(text: str, *, form: Any, expected: str) -> Any:  # noqa: ANN401 - of this form
     try:
         return TypeAdapter(form).validate_json(text)
     except ValidationError as error:
         raise argparse.ArgumentTypeError(f"got {text!r}, expected {expected}") from error
+
+
+_keywords = partial(_parsed, form=dict[str, Any], expected="a JSON object")
+_keywords_by_name = partial(
+    _parsed, form=dict[str, dict[str, Any]], expected="an object of objects"
+)
 
 
 # Options that choose items, as on the dashboard's list.
@@ -192,11 +191,8 @@ def prediction_parser() -> argparse.ArgumentParser:
     add("--episodes", required=True, metavar="STORE", help="store of held-out episodes")
     add("--checkpoint", type=Path, metavar="PATH", help="world model (default: the package's)")
     add("--tasks", type=comma_separated, default=(), help="comma-separated (default: the model's)")
-    add(
-        "--horizon",
-        choices=("windows", "rollouts"),
-        help="only windows or only rollouts (default: both)",
-    )
+    horizon = "only windows or only rollouts (default: both)"
+    add("--horizon", choices=("windows", "rollouts"), help=horizon)
     names = f"comma-separated, of {', '.join(METRIC_NAMES)} (default: all)"
     add("--metrics", type=comma_separated, default=(), help=names)
     weights = "folder of pretrained networks for the metrics that need them (docs/evaluation.md)"
@@ -246,23 +242,14 @@ def study_parser() -> argparse.ArgumentParser:
     )
     words = parser.add_subparsers(dest="word", required=True, metavar="COMMAND")
     run = words.add_parser("run", help="run a study, or continue it", **_WORDS["study run"])
-    run.add_argument("study", type=Path, metavar="STUDY", help="study file (TOML)")
-    run.add_argument(
-        "--folder",
-        type=Path,
-        metavar="PATH",
-        help="folder of results, rollouts and reports (default: the study file without .toml)",
-    )
-    run.add_argument(
-        "--store",
-        metavar="URL",
-        help="episode store of the rollouts; with the dashboard's store, it plays them "
-        "(default: rollouts/ in the folder)",
-    )
-    run.add_argument(
-        "--retry-failed", action="store_true", help="run rollouts again that failed before"
-    )
-    run.add_argument("--ray", metavar="ADDRESS", help=RAY_HELP)
+    add = run.add_argument
+    add("study", type=Path, metavar="STUDY", help="study file (TOML)")
+    results = "folder of results, rollouts and reports (default: the study file without .toml)"
+    add("--folder", type=Path, metavar="PATH", help=results)
+    store = "episode store of the rollouts; with the dashboard's store, it plays them (default: "
+    add("--store", metavar="URL", help=f"{store}rollouts/ in the folder)")
+    add("--retry-failed", action="store_true", help="run rollouts again that failed before")
+    add("--ray", metavar="ADDRESS", help=RAY_HELP)
     about = "write the report of a study's results so far"
     report = words.add_parser("report", help=about, **_WORDS["study report"])
     report.add_argument("folder", type=Path, metavar="FOLDER", help="folder of the study")
@@ -432,12 +419,11 @@ def demo_parser() -> CommandParser:
     results = "folder of the results (%(default)s)"
     parser.add_argument("--output", type=Path, default=Path("demo"), metavar="FOLDER", help=results)
     add_json(parser)
-    parser.add_argument(
-        "--train",
-        action="store_true",
-        help="train a small state model, the policy and the probe instead of using the "
-        "committed ones (takes much longer than the demo itself)",
+    train = (
+        "train a small state model, the policy and the probe instead of using the committed ones "
+        "(takes much longer than the demo itself)"
     )
+    parser.add_argument("--train", action="store_true", help=train)
     scenes = "held-out scenes per task for scoring policies (%(default)s)"
     parser.add_argument("--seeds", type=int, metavar="N", default=6, help=scenes)
     return parser

@@ -14,13 +14,7 @@ import torch
 from jaxtyping import Float64
 
 from dextouch.clients import PolicyStart
-from dextouch.episodes import (
-    EpisodeGrid,
-    EpisodeReader,
-    EpisodeStore,
-    data_hash,
-    select_episodes,
-)
+from dextouch.episodes import EpisodeGrid, EpisodeReader, EpisodeStore, data_hash, select_episodes
 from dextouch.errors import InvalidInputError, UnknownNameError
 from dextouch.hands.actions import ACTION_DIM, AnchorPoses
 from dextouch.schemas import CHUNK_STEPS, Observation, Origin
@@ -30,12 +24,8 @@ from services.evaluation import command_line as evaluation
 from services.evaluation.matched_starts import start_digest
 from services.evaluation.policies.behaviour_cloning import action_weights, from_world, in_world
 from services.evaluation.policies.cloning_training import IMITATED
-from services.evaluation.settings import TrainPolicySettings, command_line
-from services.evaluation.trained_networks import (
-    Checkpoint,
-    CheckpointMetadata,
-    load_checkpoint,
-)
+from services.evaluation.settings import CloningSettings, TrainPolicySettings, command_line
+from services.evaluation.trained_networks import Checkpoint, CheckpointMetadata
 from services.networks.weight_files import load_strictly
 from services.world_model.checkpoints import read_state_checkpoint
 from services.world_model.dynamics.features import DynamicsConfig, hand_motion
@@ -103,7 +93,8 @@ def read_places(
         raise InvalidInputError(f"place policy: got an image {image.shape}, expected {size}")
     motion = hand_motion(observation.action_reached[:1], anchor)
     index = config.tasks.index(task)
-    first = first_steps([image], [K_head], [observation.tactile_kpa[0]], [motion], [index])
+    touch, layout = observation.tactile_kpa[0], config.tactile_layout
+    first = first_steps([image], [K_head], [touch], [motion], [index], layout)
     with torch.no_grad():
         objects = mean_poses(stacked([reader(first).objects for reader in readers]))
     count = config.num_objects[index]
@@ -231,11 +222,6 @@ class PlacePolicy:
         """The tasks it has demonstrations of."""
         return self.metadata.tasks
 
-    @classmethod
-    def load(cls, path: Path) -> "PlacePolicy":
-        """Load a policy from its file."""
-        return cls(load_checkpoint(path, kind=KIND))
-
     def reset(self, start: PolicyStart) -> None:
         """Start a new rollout; raises UnknownNameError for a task without demonstrations."""
         if start.task not in self._motions:
@@ -261,9 +247,10 @@ class PlacePolicy:
 
 
 def _motion_of(task: str, tensors: dict[str, torch.Tensor]) -> Motion:
-    start = f"{_MOTION}{task}."
+    # Names of tasks may have dots.
+    named = [(name.rpartition("."), tensor) for name, tensor in tensors.items()]
     return Motion.from_tensors(
-        {name.removeprefix(start): t for name, t in tensors.items() if name.startswith(start)}
+        {last: t for (first, _, last), t in named if first == _MOTION + task}
     )
 
 
@@ -370,13 +357,20 @@ def run_train_policy(arguments: list[str]) -> int:
     settings = load_settings(TrainPolicySettings, arguments)
     if settings.places is None:
         return evaluation.run_train_policy(arguments)
-    if settings.early_at is not None:
+    unused = [
+        flag
+        for flag, is_given in {
+            "--early-at": settings.early_at is not None,
+            "--training": settings.training != CloningSettings(),
+        }.items()
+        if is_given
+    ]
+    if unused:
         raise InvalidInputError(
-            "train policy --places: got --early-at, expected none: it is fitted in one go"
+            f"train policy --places: got {' and '.join(unused)}, expected neither: the policy is "
+            "fitted in one go, without training steps"
         )
     checkpoint = train_place_policy(
-        read_demonstrations(settings),
-        settings.places,
-        command=command_line("policy", arguments),
+        read_demonstrations(settings), settings.places, command=command_line("policy", arguments)
     )
     return evaluation.keep(checkpoint, settings.output, settings.json_path)

@@ -51,10 +51,6 @@ class RobotHandCheck:
         options = RetargetOptions(max_step_rad=np.inf)
         profile = calibrated_profile(calibration, side)
         self._retargeter = HandRetargeter(side, profile, options)
-        hand = self._retargeter.hand
-        counts = [len(finger.joints) for finger in hand.fingers]
-        self._fingers = np.split(np.arange(len(hand.joint_names)), np.cumsum(counts)[:-1])
-        self._names = [finger.chain for finger in hand.fingers]
         self._before_rad: np.ndarray | None = None
         self._first: list[np.ndarray] | None = []
         # Loads the compiled solver.
@@ -103,7 +99,8 @@ class RobotHandCheck:
         before_rad = joints_rad if self._before_rad is None else self._before_rad
         too_fast = np.abs(joints_rad - before_rad) >= step_rad
         causes: dict[str, FollowCause] = {}
-        for finger, (name, joints) in enumerate(zip(self._names, self._fingers, strict=True)):
+        for finger, name in enumerate(one.chain for one in hand.fingers):
+            joints = hand.finger_of_joint == finger
             status, off_m = result.finger_status[0, finger], result.tip_error_m[0, finger]
             is_off = off_m > BLOCKED_M
             # One that was lost still comes from where it was then.

@@ -12,13 +12,7 @@ from dextouch.episodes import EpisodeStore
 from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
 from dextouch.jobs import Workers, results_of, run_jobs
 from dextouch.serving import ChildProcess
-from services.evaluation.command_line import (
-    EXIT_FAILED,
-    instructions_for,
-    opened,
-    print_failures,
-    print_scores,
-)
+from services.evaluation import command_line
 from services.evaluation.matched_starts import StudyWorlds
 from services.evaluation.policies.open_loop import ReplayPolicy
 from services.evaluation.progress import Progress
@@ -108,7 +102,7 @@ def _parts(
         partial(connect, addresses),
         policies.load,
         probe,
-        instructions_for(definition.tasks, probe.metadata.settings["instructions"]),
+        command_line.instructions_for(definition.tasks, probe.metadata.settings["instructions"]),
         policies.training_starts(),
         None if store_url is None else EpisodeStore(store_url),
         _own_probes(definition, probe),
@@ -189,7 +183,7 @@ def _own_probes(
     own: dict[str, SuccessClassifier] = {}
     for name, path in _own_paths(definition):
         own[name] = SuccessClassifier.load(path)
-        instructions_for(definition.tasks, own[name].metadata.settings["instructions"])
+        command_line.instructions_for(definition.tasks, own[name].metadata.settings["instructions"])
         size_px, expected_px = own[name].shape.image_size_px, probe.shape.image_size_px
         if size_px != expected_px:
             raise InvalidInputError(
@@ -202,10 +196,10 @@ def _own_probes(
 def _finish(results: StudyResults, json_path: Path | None) -> int:
     figures = write_reports(results, json_path)
     write_pictures(results)
-    print_scores(figures)
-    print_failures(figures, results.path)
+    command_line.print_scores(figures)
+    command_line.print_failures(figures, results.path)
     print(f"\nreport: {results.path.with_name(REPORT_FILE)}")
-    return EXIT_FAILED if figures["failures"] else 0
+    return command_line.EXIT_FAILED if figures["failures"] else 0
 
 
 @contextmanager
@@ -251,7 +245,7 @@ def _address(name: str, choice: WorldChoice) -> ServedWorld:
 
 def connect(addresses: Mapping[str, ServedWorld], connections: ExitStack) -> StudyWorlds:
     """Open connections to all worlds and ask what they are."""
-    worlds = {name: opened(one, connections) for name, one in addresses.items()}
+    worlds = {name: command_line.opened(one, connections) for name, one in addresses.items()}
     return StudyWorlds.ask(worlds.pop(REAL), worlds)
 
 

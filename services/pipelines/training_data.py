@@ -7,7 +7,7 @@ import re
 import shlex
 import time
 import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, Final
@@ -190,16 +190,16 @@ def _recorded(order: Order, options: TakeOptions) -> TruthEpisode:
     return record(stage, order.seed, options, played=played)
 
 
-def _write_directly(order: Order) -> TruthEpisode:
-    episode = _recorded(order, order.options)
-    write_episode(EpisodeStore(order.store), episode)
-    return episode
-
-
-def _write_by_station(order: Order) -> TruthEpisode:
+def _written(order: Order) -> TruthEpisode:
+    """Record a take, and write it as it is, or what a station and alignment make of it."""
+    if order.path == "direct":
+        episode = _recorded(order, order.options)
+        write_episode(EpisodeStore(order.store), episode)
+        return episode
     # Loads the compiled solver of retargeting.
     from services.pipelines.mock_takes import device_options, write_by_station
 
+    # By devices with the twin's labels; by a station without them, markers on objects are measured.
     options, objects = device_options(order.options), None
     if order.path == "station":
         stage, objects = marked_stage(order.task, order.domain)
@@ -211,19 +211,10 @@ def _write_by_station(order: Order) -> TruthEpisode:
     return episode
 
 
-# How a take becomes an episode: written as it is; by devices, drivers, recorder and alignment, with
-# the twin's labels; or the same without them, objects being measured by the markers on them.
-_WRITERS: Final[dict[TakePath, Callable[[Order], TruthEpisode]]] = {
-    "direct": _write_directly,
-    "devices": _write_by_station,
-    "station": _write_by_station,
-}
-
-
 def make_episode(order: Order) -> Answer:
     """Record one episode and write it to its store."""
     try:
-        episode = _WRITERS[order.path](order)
+        episode = _written(order)
     except ConflictError:
         return Answer(order.episode_id)
     except (InvalidInputError, DeviceError) as error:

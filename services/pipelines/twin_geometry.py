@@ -8,20 +8,13 @@ from jaxtyping import Float64, Int64
 
 from dextouch.episodes import EpisodeReader, object_track
 from dextouch.hands.actions import HandTrajectory, poses_from_actions
-from services.evaluation.prediction_scenes import (
-    BACKGROUND,
-    FAR_M,
-    FIRST_BODY,
-    TABLE,
-    Scene,
-    SceneGeometry,
-)
+from services.evaluation import prediction_scenes
 from services.twin import cameras
 from services.twin.settings import TwinSettings
 from services.twin.stage import Stage, command_row
 
 # The bodies are both hands, then the objects.
-FIRST_OBJECT: Final = FIRST_BODY + 2
+FIRST_OBJECT: Final = prediction_scenes.FIRST_BODY + 2
 
 
 class SceneViews:
@@ -35,14 +28,14 @@ class SceneViews:
     def __init__(self, stage: Stage) -> None:
         self.stage, scene = stage, stage.simulation.scene
         self.names = ("background", "table", "left_hand", "right_hand", *scene.object_names)
-        labels = np.full(scene.model.ngeom, BACKGROUND)
-        labels[scene.table_geom] = TABLE
+        labels = np.full(scene.model.ngeom, prediction_scenes.BACKGROUND)
+        labels[scene.table_geom] = prediction_scenes.TABLE
         of_hand, of_object = scene.geom_hand >= 0, scene.geom_object >= 0
-        labels[of_hand] = FIRST_BODY + scene.geom_hand[of_hand]
+        labels[of_hand] = prediction_scenes.FIRST_BODY + scene.geom_hand[of_hand]
         labels[of_object] = FIRST_OBJECT + scene.geom_object[of_object]
         self._labels: Int64[np.ndarray, " geoms"] = labels.astype(np.int64)
         rows = np.column_stack([labels, scene.model.geom_rgba[:, :3]])[labels > 0]
-        seen = np.vstack([[BACKGROUND, *cameras.BACKGROUND], rows])
+        seen = np.vstack([[prediction_scenes.BACKGROUND, *cameras.BACKGROUND], rows])
         self.colours: Float64[np.ndarray, "colours 4"] = np.unique(seen.round(6), axis=0)
 
     def of(
@@ -56,7 +49,7 @@ class SceneViews:
         simulation = self.stage.simulation
         simulation.pose(command_row(poses, step), object_poses[step])
         geoms, depth_m = self.stage.rig.cast(simulation, "camera_head")
-        return np.where(geoms >= 0, self._labels[geoms], BACKGROUND), depth_m
+        return np.where(geoms >= 0, self._labels[geoms], prediction_scenes.BACKGROUND), depth_m
 
 
 class TwinGeometry:
@@ -65,7 +58,9 @@ class TwinGeometry:
     def __init__(self) -> None:
         self._views: dict[tuple[str, tuple[int, ...]], SceneViews] = {}
 
-    def added_to(self, scene: Scene, reader: EpisodeReader) -> Scene:
+    def added_to(
+        self, scene: prediction_scenes.Scene, reader: EpisodeReader
+    ) -> prediction_scenes.Scene:
         """The scene with its geometry; unchanged if its episode is not of the twin."""
         about = reader.attributes
         window = reader.window(0, reader.num_steps, cameras=())
@@ -78,7 +73,7 @@ class TwinGeometry:
         steps = [scene.first_step + step for step in scene.truth.image_steps]
         seen = [views.of(poses, objects, step) for step in steps]
         table = [_table_m(views.stage, poses.Ts_world_camera_head[step]) for step in steps]
-        geometry = SceneGeometry(
+        geometry = prediction_scenes.SceneGeometry(
             views.colours,
             np.stack([labels for labels, _ in seen]),
             np.stack([depth_m for _, depth_m in seen]),
@@ -99,4 +94,4 @@ def _table_m(stage: Stage, T_world_camera: np.ndarray) -> Float64[np.ndarray, "h
     rays = stage.rig.rays["camera_head"]
     down = -(rays @ T_world_camera[:3, :3].T)[:, 2]
     distance_m = T_world_camera[2, 3] / np.where(down > 1e-6, down, 1e-6)
-    return np.minimum(distance_m * rays[:, 2], FAR_M).reshape(stage.rig.shape_px)
+    return np.minimum(distance_m * rays[:, 2], prediction_scenes.FAR_M).reshape(stage.rig.shape_px)

@@ -19,12 +19,13 @@ from dextouch.hands import (
     MEAN_FINGERS,
     MEAN_THUMB_BASE_M,
     MEAN_THUMB_BONES_M,
-    NODE_INDEX,
+    METACARPAL_NODES,
     NUM_KEYPOINTS,
     FingerTable,
     JointRow,
     Quaternion,
     Vector3,
+    mean_hand_m,
     solver_indices,
 )
 from dextouch.hands.robot_hand import HandModel, RobotHand
@@ -39,10 +40,6 @@ PALM_THICKNESS_M: Final = 0.024
 TIP_COLUMN_ANGLES_RAD: Final = np.deg2rad([60.0, 20.0, -20.0, -60.0])
 TIP_CAP_ANGLES_RAD: Final = np.deg2rad([52.0, 20.0])
 TIP_SHAFT_M: Final = (0.002, 0.007)
-# Base of each finger's metacarpal in the right wrist frame, metres.
-METACARPAL_BASES_M: Final[dict[str, np.ndarray]] = {
-    name: np.array(base_m) for name, (base_m, _, _) in MEAN_FINGERS.items()
-}
 # Limits of a finger and the thumb; turns of the thumb's hinges as on the robot.
 _FINGER_LIMITS_RAD: Final = ((-0.5, 1.57), (-0.35, 0.35), (0.0, 1.92), (0.0, 1.40))
 _THUMB_LIMITS_RAD: Final = ((-1.0, 1.2), (-1.4, 0.6), (-0.5, 1.3), (-0.5, 1.5))
@@ -95,11 +92,9 @@ class HumanHand(HandModel):
         """The 25 tracked nodes in wrist coordinates, metres, for joint angles [T, 20]."""
         chains = self.chain_points_m(joints_rad)
         points = np.zeros((len(chains), NUM_KEYPOINTS, 3))
-        mirror = np.array([1.0, 1.0 if self.side == "right" else -1.0, 1.0])
+        points[:, METACARPAL_NODES] = mean_hand_m(self.side)[METACARPAL_NODES, :]
         for finger_index, chain in enumerate(CHAINS):
             points[:, solver_indices(chain)] = chains[:, finger_index]
-        for chain, base_m in METACARPAL_BASES_M.items():
-            points[:, NODE_INDEX[chain, "metacarpal"]] = base_m * mirror
         return points
 
 
@@ -166,7 +161,7 @@ def twin_hand(side: Side, domain: Domain) -> TwinHand:
 
 def human_fingers(side: str) -> tuple[FingerTable, ...]:
     """Finger tables, thumb … little, of a "left" or "right" human hand."""
-    right = (_thumb(), *(_finger(name) for name in METACARPAL_BASES_M))
+    right = (_thumb(), *map(_finger, MEAN_FINGERS))
     return right if side == "right" else tuple(map(_mirrored, right))
 
 

@@ -31,11 +31,7 @@ from services.networks.weight_files import (
 )
 from services.world_model.dynamics.features import DynamicsConfig
 from services.world_model.dynamics.model import DynamicsModel
-from services.world_model.network.configuration import (
-    NetworkConfig,
-    RendererConfig,
-    TokenizerName,
-)
+from services.world_model.network.configuration import NetworkConfig, RendererConfig, TokenizerName
 from services.world_model.network.model import JointWorldModel
 from services.world_model.network.tactile import TactileTokenizer, build_tokenizer
 from services.world_model.rendering.renderer import RendererNetwork
@@ -126,13 +122,6 @@ def dropout_shares(text: float, action: float, ancestor: Checkpoint | None) -> t
     if ancestor is not None and not (text or action):
         return ancestor.metadata.text_dropout, ancestor.metadata.action_dropout
     return text, action
-
-
-def view_dropout(share: float, network: NetworkConfig, before: CheckpointMetadata | None) -> float:
-    """Share of windows without a further view for the metadata, as `dropout_shares`."""
-    if not network.further_views:
-        return 0.0
-    return share or (before.view_dropout if before else 0.0)
 
 
 def write_checkpoint(path: Path, model: JointWorldModel, metadata: CheckpointMetadata) -> str:

@@ -10,15 +10,8 @@ from dextouch.command_line import ProgressLines, progress, write_result
 from dextouch.serving import load_settings
 from dextouch.worlds import World, serve_worlds
 from services.networks.weight_files import digest_of
-from services.world_model import checkpoints
+from services.world_model import checkpoints, paper_settings
 from services.world_model.network.model import Sampling
-from services.world_model.paper_settings import (
-    CacheCommand,
-    DistillCommand,
-    TrainSettings,
-    adapt_settings,
-    train_settings,
-)
 from services.world_model.plan import plan_table, training_table
 from services.world_model.settings import (
     AdaptStateCommand,
@@ -37,7 +30,7 @@ if TYPE_CHECKING:
 
 def run_train(arguments: list[str]) -> int:
     """Train the form that --preset names; print the report and optionally write it to a file."""
-    settings = load_settings(train_settings(arguments), arguments)
+    settings = load_settings(paper_settings.train_settings(arguments), arguments)
     if isinstance(settings, TrainStateCommand):
         return _train_state(settings)
     if settings.plan:
@@ -50,7 +43,7 @@ def run_train(arguments: list[str]) -> int:
 
 def run_adapt(arguments: list[str]) -> int:
     """Adapt a checkpoint to new tasks, as `run_train`."""
-    settings = load_settings(adapt_settings(arguments), arguments)
+    settings = load_settings(paper_settings.adapt_settings(arguments), arguments)
     if isinstance(settings, AdaptStateCommand):
         return _train_state(settings)
     network = checkpoints.read_checkpoint(settings.init).metadata.network
@@ -59,14 +52,14 @@ def run_adapt(arguments: list[str]) -> int:
 
 def run_distill(arguments: list[str]) -> int:
     """Train a checkpoint to sample in few steps, as `run_train`."""
-    settings = load_settings(DistillCommand, arguments)
+    settings = load_settings(paper_settings.DistillCommand, arguments)
     network = checkpoints.read_checkpoint(settings.init).metadata.network
     return _train(settings.training(network), settings.json_path)
 
 
 def run_cache(arguments: list[str]) -> int:
     """Encode the images of a training, and print how many windows there are."""
-    settings = load_settings(CacheCommand, arguments)
+    settings = load_settings(paper_settings.CacheCommand, arguments)
     if settings.plan:
         return run_train(arguments)
     filled = fill_latent_cache(settings, lambda some: progress(some, "latents", len(some)))
@@ -78,7 +71,7 @@ def run_cache(arguments: list[str]) -> int:
     return 0
 
 
-def _train(settings: TrainSettings, json_path: Path | None) -> int:
+def _train(settings: paper_settings.TrainSettings, json_path: Path | None) -> int:
     lines = ProgressLines("training", has_bar=False)
 
     def on_progress(now: TrainingProgress) -> None:

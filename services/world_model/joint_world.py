@@ -11,13 +11,7 @@ from jaxtyping import Float16, Float32, Float64, UInt8
 from dextouch.errors import InvalidInputError
 from dextouch.geometry import apply
 from dextouch.hands.actions import AnchorPoses, check_actions, poses_from_actions, reanchor
-from dextouch.schemas import (
-    ActionKind,
-    Observation,
-    ReturnSelector,
-    RolloutStart,
-    WorldDescription,
-)
+from dextouch.schemas import ActionKind, Observation, ReturnSelector, RolloutStart, WorldDescription
 from dextouch.streams import HEAD_CAMERA, pack
 from dextouch.tactile.layout import described
 from dextouch.worlds import StartedRollout, SteppedRollout, asked_cameras

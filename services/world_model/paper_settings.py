@@ -18,19 +18,7 @@ from dextouch.serving import (
     section_of,
     service_config,
 )
-from services.networks.training_settings import (
-    AdamWSettings,
-    Batch,
-    CpuBudget,
-    Device,
-    LearningRate,
-    MaxSteps,
-    Seed,
-    Share,
-    Splits,
-    Stores,
-    WarmupSteps,
-)
+from services.networks import training_settings
 from services.world_model.network.configuration import (
     NetworkConfig,
     Precision,
@@ -50,7 +38,7 @@ from services.world_model.settings import (
 STATE: Final = "state"
 
 
-class OptimizerSettings(AdamWSettings):
+class OptimizerSettings(training_settings.AdamWSettings):
     """Settings of the optimizer and of the loss."""
 
     tactile_weight: float = Field(default=1.0, ge=0, description="lambda_tac (equation 5)")
@@ -63,27 +51,33 @@ class OptimizerSettings(AdamWSettings):
 class AdaptOptimizerSettings(OptimizerSettings):
     """Settings of the optimizer with a tenth of the learning rate from random weights."""
 
-    learning_rate: LearningRate = 2e-4
-    warmup_steps: WarmupSteps = 20
+    learning_rate: training_settings.LearningRate = 2e-4
+    warmup_steps: training_settings.WarmupSteps = 20
 
 
 class WindowSettings(FrozenModel):
     """Sampling of training windows."""
 
-    short_fraction: Share = Field(default=0.25, description="share of short windows")
-    context_noise: Share = Field(default=0.05, description="noise on the first latents")
-    text_dropout: Share = Field(
+    short_fraction: training_settings.Share = Field(
+        default=0.25, description="share of short windows"
+    )
+    context_noise: training_settings.Share = Field(
+        default=0.05, description="noise on the first latents"
+    )
+    text_dropout: training_settings.Share = Field(
         default=0.0, description="share of windows without instruction, for --guidance of serving"
     )
-    action_dropout: Share = Field(
+    action_dropout: training_settings.Share = Field(
         default=0.0, description="share of windows without actions, for --guidance of serving"
     )
-    view_dropout: Share = Field(
+    view_dropout: training_settings.Share = Field(
         default=0.1,
         description="share of windows without a further view, so that starts and episodes may lack "
         "it; 0: they are refused",
     )
-    past_dropout: Share = Field(default=0.1, description="share of windows without past images")
+    past_dropout: training_settings.Share = Field(
+        default=0.1, description="share of windows without past images"
+    )
     fit_windows: int = Field(default=256, ge=4, description="windows the codecs are fitted on")
 
 
@@ -127,7 +121,7 @@ class RunSettings(DataSettings):
         default=None, gt=0, description="CPU seconds of a process after which it ends, in all"
     )
     num_threads: int = Field(default=1, ge=1, description="threads of torch")
-    device: Device = "cpu"
+    device: training_settings.Device = "cpu"
     wan: WanFiles = Field(default=WanFiles(), description="files of the pretrained networks")
     heldout_percent: int = Field(
         default=10, ge=1, le=50, description="percentage of episodes held out without --heldout"
@@ -236,16 +230,16 @@ class FromCheckpointSettings(RunSettings):
 class TokenizerOptimizer(FrozenModel):
     """Settings of the optimizer."""
 
-    batch: Batch = 128
-    learning_rate: LearningRate = 6e-3
-    warmup_steps: WarmupSteps = 50
+    batch: training_settings.Batch = 128
+    learning_rate: training_settings.LearningRate = 6e-3
+    warmup_steps: training_settings.WarmupSteps = 50
 
 
 class TrainTokenizerSettings(FrozenModel):
     """One training run; `cpu_budget_s` or `max_steps` ends it, whichever comes first."""
 
-    episodes: Stores
-    splits: Splits = ()
+    episodes: training_settings.Stores
+    splits: training_settings.Splits = ()
     tokenizer: TokenizerName = Field(
         default="split_hands",
         description="split_hands (the paper's), grid (its baseline), or principal_axes",
@@ -253,9 +247,9 @@ class TrainTokenizerSettings(FrozenModel):
     output: Path = Field(
         default=Path("runs/world_model/tokenizer.safetensors"), description="file to write"
     )
-    seed: Seed = 0
-    cpu_budget_s: CpuBudget = 60.0
-    max_steps: MaxSteps = None
+    seed: training_settings.Seed = 0
+    cpu_budget_s: training_settings.CpuBudget = 60.0
+    max_steps: training_settings.MaxSteps = None
     num_threads: int = Field(default=1, ge=1, description="threads of torch")
     heldout_share: float = Field(default=0.1, gt=0, lt=1, description="share of held-out scenes")
     contact_weight: float = Field(

@@ -25,12 +25,7 @@ from dextouch.streams import HEAD_CAMERA, unpack
 from dextouch.tactile.layout import DEXTOUCH_V1, TactileLayout
 from dextouch.worlds import BatchWorld, SteppedRollout, check_chunk
 from services.world_model.checkpoints import StateCheckpoint
-from services.world_model.dynamics.features import (
-    BOX_AXES,
-    STEPS_PER_LATENT,
-    hand_motion,
-    poses_from_objects,
-)
+from services.world_model.dynamics import features
 from services.world_model.dynamics.model import first_steps, mean_poses
 from services.world_model.dynamics.tensor_trees import stacked
 from services.world_model.network.inputs import ObjectsAtStart, PredictionRequest
@@ -201,7 +196,7 @@ class PredictedWorld(BatchWorld[State]):
             )
         world, limit = self._description, LAST_HORIZONS * self._horizon_latents
         if any(state.num_moving >= limit for state in states):
-            seconds = limit * STEPS_PER_LATENT / world.model_rate_hz
+            seconds = limit * features.STEPS_PER_LATENT / world.model_rate_hz
             reason = (
                 f"hands moved for {seconds:.0f} s, four times as long as any episode this model "
                 "was trained on"
@@ -260,7 +255,7 @@ class SceneReader:
         unknown = sorted(set(tasks) - set(self.tasks))
         if unknown:
             raise UnknownNameError("task of the start readers", unknown[0], list(self.tasks))
-        hands = [hand_motion(request.actions[:1], request.anchor) for request in requests]
+        hands = [features.hand_motion(request.actions[:1], request.anchor) for request in requests]
         first = first_steps(
             [request.first_image for request in requests],
             [request.K_head for request in requests],
@@ -270,11 +265,11 @@ class SceneReader:
             self.tactile_layout,
         )
         readings = [reader(first) for reader in self._readers]
-        poses = poses_from_objects(mean_poses(stacked([one.objects for one in readings])))
+        poses = features.poses_from_objects(mean_poses(stacked([one.objects for one in readings])))
         size = stacked([one.size for one in readings]).mean(0).double().numpy()
         found = []
         for row, task in enumerate(tasks):
             boxes_m = np.array(self._metadata.object_boxes_m[task])
             here = row, slice(len(boxes_m))
-            found.append(ObjectsAtStart(poses[here], boxes_m * size[here][:, BOX_AXES]))
+            found.append(ObjectsAtStart(poses[here], boxes_m * size[here][:, features.BOX_AXES]))
         return found

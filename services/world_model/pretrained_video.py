@@ -12,14 +12,7 @@ from torch import Tensor, nn
 from torch.distributed.tensor import DTensor
 
 from dextouch.errors import CorruptDataError, InvalidInputError, NotFoundError
-from services.networks.weight_files import (
-    allocate,
-    available_memory,
-    check_memory,
-    fill,
-    memory_of,
-    refuse_non_finite,
-)
+from services.networks import weight_files
 from services.world_model.network.codecs import WanVideoCodec
 from services.world_model.network.configuration import NetworkConfig, WanFiles
 from services.world_model.network.model import JointWorldModel
@@ -58,7 +51,7 @@ def initial_model(
     if files.folder is not None:
         load_pretrained(model, files.folder, max_bytes=files.max_bytes)
     elif filled_later:
-        allocate(model)
+        weight_files.allocate(model)
     else:
         raise InvalidInputError(
             "pretrained video expert: got no folder; give the local folder of Wan2.2-TI2V-5B "
@@ -194,15 +187,15 @@ def load_weights(
                 "folder holds a model of another size"
             )
     limit = _available(expected) if max_bytes is None else max_bytes
-    check_memory(memory_of(expected), where=where, max_bytes=limit)
-    allocate(network)
+    weight_files.check_memory(weight_files.memory_of(expected), where=where, max_bytes=limit)
+    weight_files.allocate(network)
     expected = network.state_dict()
     for file in files:
         with safe_open(file, framework="pt") as opened:
             for name in opened.keys():  # noqa: SIM118
                 tensor = opened.get_tensor(name)
-                refuse_non_finite({name: tensor}, where)
-                fill(expected[name], tensor)
+                weight_files.refuse_non_finite({name: tensor}, where)
+                weight_files.fill(expected[name], tensor)
 
 
 def _available(weights: Mapping[str, Tensor]) -> int | None:
@@ -210,7 +203,7 @@ def _available(weights: Mapping[str, Tensor]) -> int | None:
     meshes = [one.device_mesh for one in weights.values() if isinstance(one, DTensor)]
     if meshes and meshes[0].device_type == "cuda":
         return torch.cuda.mem_get_info()[0]
-    free = available_memory()
+    free = weight_files.available_memory()
     # torchrun's number of processes on this machine, each with weights of its own.
     return None if free is None else free // int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
 

@@ -1,5 +1,6 @@
 """Settings of the state model and of serving, from flags and environment variables."""
 
+import shlex
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Literal
@@ -355,7 +356,7 @@ def recorded_command(
 
     given = settings.model_dump(mode="json", exclude_defaults=True, exclude=left_out)
     known = {name: given.pop(name) for name in places if name in given}
-    return " ".join([command, *flags_of(known, last_name), *flags_of(given)])
+    return f"{command} {shlex.join([*flags_of(known, last_name), *flags_of(given)])}".rstrip()
 
 
 def flags_of(

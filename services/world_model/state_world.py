@@ -24,13 +24,8 @@ from dextouch.worlds import StartedRollout, SteppedRollout
 from services.world_model import predicted_world
 from services.world_model.checkpoints import StateCheckpoint
 from services.world_model.dynamics import features, model
+from services.world_model.network import inputs
 from services.world_model.network.configuration import NetworkConfig
-from services.world_model.network.inputs import (
-    ACTION_KINDS,
-    PredictionRequest,
-    build_inputs,
-    check_reach,
-)
 from services.world_model.rendering.rasters import SceneStates
 from services.world_model.rendering.renderer import Drawing, Renderer
 
@@ -86,7 +81,7 @@ class StateWorld(predicted_world.PredictedWorld[StateRollout]):
             image_height_px=config.image_px,
             image_width_px=config.image_px,
             model_rate_hz=self._metadata.model_rate_hz,
-            action_kinds=ACTION_KINDS,
+            action_kinds=inputs.ACTION_KINDS,
             starts_from=("observation",),
             chunk_multiple=features.STEPS_PER_LATENT,
             object_names=self._metadata.object_names,
@@ -135,7 +130,7 @@ class StateWorld(predicted_world.PredictedWorld[StateRollout]):
     def _check_start(self, start: RolloutStart, first: predicted_world.ObservedStart) -> None:
         """Checks of all world models: hands and camera must be within reach."""
         predicted_world.check_geometry(first.anchor, first.K_head)
-        request = PredictionRequest(
+        request = inputs.PredictionRequest(
             first_image=first.image,
             first_tactile_kpa=first.tactile_kpa,
             actions=np.repeat(first.reached[None], 1 + features.STEPS_PER_LATENT, axis=0),
@@ -146,7 +141,7 @@ class StateWorld(predicted_world.PredictedWorld[StateRollout]):
         )
         config = self._metadata.dynamics
         limits = NetworkConfig(image_px=config.image_px).with_layout(config.tactile_layout)
-        build_inputs([request], limits)
+        inputs.build_inputs([request], limits)
 
     @torch.inference_mode()
     def _stepped(
@@ -157,7 +152,7 @@ class StateWorld(predicted_world.PredictedWorld[StateRollout]):
         requested: list[ReturnSelector],
     ) -> list[SteppedRollout[StateRollout]]:
         for chunk in chunks:
-            check_reach(chunk)
+            inputs.check_reach(chunk)
         motions = [
             features.hand_motion(chunk, state.anchor, validated=True)
             for chunk, state in zip(chunks, states, strict=True)
@@ -316,7 +311,7 @@ class StateWorld(predicted_world.PredictedWorld[StateRollout]):
         shapes = {"image": size, "anchor": (3, 4, 4), "K_head": (3, 3), "first_reached": (67,)}
         if (
             name not in config.tasks
-            or fields.get("action_kind") not in ACTION_KINDS
+            or fields.get("action_kind") not in inputs.ACTION_KINDS
             or not (isinstance(step, int) and isinstance(moving, int) and min(step, moving) >= 0)
             or arrays.get("image", np.zeros(0)).dtype != np.uint8
             or any(key not in arrays or arrays[key].shape != shapes[key] for key in shapes)
@@ -328,7 +323,7 @@ class StateWorld(predicted_world.PredictedWorld[StateRollout]):
         if int(memory.start.task[0, 0]) != config.tasks.index(name):
             raise InvalidInputError(f"snapshot: its memory belongs to another task than {name!r}")
         first_reached = check_actions(arrays["first_reached"][None], where="snapshot")
-        check_reach(first_reached)
+        inputs.check_reach(first_reached)
         return StateRollout(
             task=name,
             action_kind=fields["action_kind"],

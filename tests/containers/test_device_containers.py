@@ -51,6 +51,7 @@ def nodes():
 def test_the_station_may_open_its_kinds_of_devices_only(engine, built, keys, nodes):
     variables = {
         **keys,
+        "DEXTOUCH_ACQUISITION_DEVICES": "[]",
         "DEXTOUCH_HIDRAW_MAJOR": str(HIDRAW),
         "DEXTOUCH_DEVICE_GROUP": str(GROUP),
     }

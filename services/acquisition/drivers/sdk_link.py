@@ -94,7 +94,11 @@ class BridgeHello(FrozenModel):
 
     @model_validator(mode="after")
     def _tells_devices_apart(self) -> "BridgeHello":
-        for name in ("index", "serial_number"):
+        names = ["index", "serial_number"]
+        if self.kind != "pose_tracker":
+            # Packets of poses alone carry the index: of others the source says whose they are.
+            names.append("source")
+        for name in names:
             values = [getattr(device, name) for device in self.devices]
             if len(set(values)) < len(values):
                 raise ValueError(f"devices: {name} {values} are not all different")
@@ -110,11 +114,7 @@ class BridgeHello(FrozenModel):
 
 
 def parse_hello(line: bytes, *, device: str) -> BridgeHello:
-    """The hello of a bridge.
-
-    Raises:
-        DeviceError: no such hello, or one of another version.
-    """
+    """The hello of a bridge; raises DeviceError: none, or one of another version."""
     try:
         hello = BridgeHello.model_validate_json(line)
     except ValidationError as error:
@@ -205,11 +205,7 @@ class BridgeDecoder(StreamDecoder[Packet]):
         self._freshness.reset()
 
     def feed(self, data: bytes, t_host_ns: int = 0) -> list[Sample]:
-        """New samples.
-
-        Raises:
-            DeviceError: no hello, another version, or a bridge without the wanted device.
-        """
+        """New samples; raises DeviceError: no hello, as `parse_hello`, or not the wanted device."""
         if self.hello is None:
             data = self._hear_hello(data)
         return super().feed(data, t_host_ns)
@@ -303,11 +299,7 @@ class BridgeDriver(Driver):
         self._first: Readings = {}
 
     def open(self) -> None:
-        """Connect and learn who is there.
-
-        Raises:
-            DeviceError: no connection, no hello within 2 s, or another device than requested.
-        """
+        """Connect; raises DeviceError: no link, no hello within 2 s, or not the wanted device."""
         super().open()
         for _ in range(HELLO_READS):
             self._first = super().read()
@@ -323,9 +315,8 @@ class BridgeDriver(Driver):
     def read(self) -> Readings:
         """New samples; empty when nothing came.
 
-        Raises:
-            StaleDataError: the bridge has sent nothing for 200 ms.
-            DeviceError: the bridge is disconnected or uses another protocol.
+        Raises StaleDataError: the bridge has sent nothing for 200 ms; DeviceError: it is
+        disconnected or uses another protocol.
         """
         if self._first:
             first, self._first = self._first, {}

@@ -9,6 +9,7 @@ import ctypes
 import struct
 import time
 from collections.abc import Sequence
+from math import isfinite
 from typing import Any
 
 from dextouch.errors import DeviceError, InvalidInputError
@@ -47,8 +48,7 @@ class LslStream(bridge.Source):
     def open(self) -> BridgeHello:
         """Find the outlet, connect to it, and measure the offset of its clock.
 
-        Raises:
-            InvalidInputError: several outlets, or one without numbers.
+        Raises InvalidInputError: several outlets, or one without numbers.
         """
         lsl = bridge.import_sdk("pylsl", install=INSTALL)
         found = lsl.resolve_byprop(self._by, self._value, minimum=2, timeout=RESOLVE_S)
@@ -93,7 +93,9 @@ class LslStream(bridge.Source):
         offset_ns = bridge.station_offset_ns(self._clock)
         readings = []
         for values, stamp_s in zip(samples, stamps, strict=True):
-            t_ns = round((stamp_s + self._correction_s) * 1e9) + offset_ns
+            corrected_s = stamp_s + self._correction_s
+            # One without a time is not sent, as one from before the clock's start.
+            t_ns = round(corrected_s * 1e9) + offset_ns if isfinite(corrected_s) else -1
             payload = struct.pack(f"<{len(values)}d", *values)
             readings.append(bridge.Reading(self._value, SOURCES["none"], t_ns, payload))
         return readings

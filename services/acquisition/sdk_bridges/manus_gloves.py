@@ -206,6 +206,10 @@ class ManusGloves(bridge.Source):
         self._has_some.set()
 
     def _reading(self, skeleton: _Skeleton) -> bridge.Reading | None:
+        if self._published.get(skeleton.glove_id) == skeleton.publish_time:
+            self.not_sent["unchanged"] += 1
+            return None
+        self._published[skeleton.glove_id] = skeleton.publish_time
         side, places = self._glove(skeleton)
         owner, owner_ns = self._owners.get(side, (skeleton.glove_id, 0))
         is_other = owner != skeleton.glove_id and skeleton.t_ns - owner_ns < REPLACED_NS
@@ -213,10 +217,6 @@ class ManusGloves(bridge.Source):
             self.not_sent["another glove"] += 1
             return None
         self._owners[side] = (skeleton.glove_id, skeleton.t_ns)
-        if self._published.get(skeleton.glove_id) == skeleton.publish_time:
-            self.not_sent["unchanged"] += 1
-            return None
-        self._published[skeleton.glove_id] = skeleton.publish_time
         points, wrist, q_wxyz = np.full((NUM_KEYPOINTS, 3), np.nan), np.zeros(3), np.zeros(4)
         for node, place in zip(skeleton.nodes, places, strict=True):
             points[place] = node.position.x, node.position.y, node.position.z

@@ -423,7 +423,7 @@ class HandRetargeter:
     def _filled(self, result: RetargetResult, t_s: np.ndarray) -> np.ndarray:
         """Angles with untracked stretches of fingers filled linearly, in time; held at ends."""
         filled = result.joints_rad.copy()
-        for joint, finger in enumerate(np.nonzero(self._is_joint)[0]):
+        for joint, finger in enumerate(self.hand.finger_of_joint):
             known = result.solved[:, finger]
             if not known.any():
                 continue

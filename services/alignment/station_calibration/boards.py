@@ -13,19 +13,9 @@ from dextouch.data_folder import is_system_file
 from dextouch.errors import CorruptDataError, InvalidInputError, NotFoundError, UnknownNameError
 from dextouch.geometry import Distortion, apply, transform
 from dextouch.geometry.rotations import rotation_from_vector
-from services.alignment.calibration.intrinsics import (
-    DICTIONARIES,
-    CharucoBoard,
-    Chessboard,
-    FoundBoards,
-    LensModelError,
-    calibrate_found,
-    edge_width_px,
-    find_boards,
-    max_edge_width_px,
-)
+from services.alignment.calibration import intrinsics
 
-Board = Chessboard | CharucoBoard
+Board = intrinsics.Chessboard | intrinsics.CharucoBoard
 SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff")
 BOARD_HELP = (
     "chessboard:9x6:25mm (inner corners, square) or "
@@ -103,7 +93,7 @@ class Photos:
         """Number of all photos."""
         return len(self.views) + len(self.without_board) + len(self.blurred)
 
-    def corners(self) -> FoundBoards:
+    def corners(self) -> intrinsics.FoundBoards:
         """The views as the solver takes them."""
         return replace(found_boards(self.views, self.size_px), num_photos=len(self))
 
@@ -128,11 +118,11 @@ def parse_board(text: str) -> Board:
     columns, rows, square, unit, *marker = matched.groups()
     size = (int(columns), int(rows), float(square) * _METRES[unit])
     if not marker:
-        return Chessboard(*size)
-    dictionary = marker[2] or CharucoBoard.dictionary
-    if dictionary not in DICTIONARIES:
-        raise UnknownNameError("marker dictionary", dictionary, list(DICTIONARIES))
-    return CharucoBoard(*size, float(marker[0]) * _METRES[marker[1]], dictionary)
+        return intrinsics.Chessboard(*size)
+    dictionary = marker[2] or intrinsics.CharucoBoard.dictionary
+    if dictionary not in intrinsics.DICTIONARIES:
+        raise UnknownNameError("marker dictionary", dictionary, list(intrinsics.DICTIONARIES))
+    return intrinsics.CharucoBoard(*size, float(marker[0]) * _METRES[marker[1]], dictionary)
 
 
 def photo_paths(folder: Path) -> list[Path]:
@@ -157,14 +147,14 @@ def decode_photo(data: bytes, *, where: str) -> UInt8[np.ndarray, "h w"]:
 
 def find_board(name: str, photo: np.ndarray, board: Board) -> BoardView | None:
     """Detect the board in a grey photo (uint8 [h, w]); None if not found."""
-    found = find_boards([photo], board)
+    found = intrinsics.find_boards([photo], board)
     if not found.photos:
         return None
     pixels = found.pixels_px[0]
-    if isinstance(board, Chessboard):
+    if isinstance(board, intrinsics.Chessboard):
         pixels = _dark_first(photo, pixels, board)
-    width_px = edge_width_px(photo, found.points_board[0], pixels)
-    is_blurred = width_px > max_edge_width_px(photo)
+    width_px = intrinsics.edge_width_px(photo, found.points_board[0], pixels)
+    is_blurred = width_px > intrinsics.max_edge_width_px(photo)
     return BoardView(name, found.points_board[0], pixels, found.pattern, is_blurred)
 
 
@@ -198,7 +188,7 @@ def read_photos(paths: Sequence[Path], board: Board) -> Photos:
 
 def is_ambiguous(board: Board) -> bool:
     """Whether the board is symmetric under a half turn, so that its pose is ambiguous."""
-    return isinstance(board, Chessboard) and (board.columns - board.rows) % 2 == 0
+    return isinstance(board, intrinsics.Chessboard) and (board.columns - board.rows) % 2 == 0
 
 
 def check_unambiguous(board: Board, text: str) -> None:
@@ -241,7 +231,7 @@ def reprojection(view: BoardView, lens: Lens) -> Float64[np.ndarray, "n 2"]:
     return view.pixels.astype(np.float64) - np.asarray(predicted).reshape(-1, 2)
 
 
-def _dark_first(photo: np.ndarray, pixels: np.ndarray, board: Chessboard) -> np.ndarray:
+def _dark_first(photo: np.ndarray, pixels: np.ndarray, board: intrinsics.Chessboard) -> np.ndarray:
     """Order the corners to start beside a dark square, where that resolves the symmetry."""
     if is_ambiguous(board):
         return pixels
@@ -294,8 +284,8 @@ def camera_coverage(
 def _focal_sigma(views: Sequence[BoardView], size_px: tuple[int, int]) -> tuple[float, str]:
     """Sigma of the focal length as a share of it, and why no camera of the model took the views."""
     try:
-        return calibrate_found(found_boards(views, size_px)).focal_sigma, ""
-    except LensModelError as error:
+        return intrinsics.calibrate_found(found_boards(views, size_px)).focal_sigma, ""
+    except intrinsics.LensModelError as error:
         return float("inf"), error.message
     except InvalidInputError:
         return float("inf"), ""
@@ -312,12 +302,14 @@ def _surer(focal_sigma: float, tilts_rad: np.ndarray) -> str:
     )
 
 
-def found_boards(views: Sequence[BoardView], size_px: tuple[int, int]) -> FoundBoards:
+def found_boards(views: Sequence[BoardView], size_px: tuple[int, int]) -> intrinsics.FoundBoards:
     """Views as the solver takes them."""
     points = tuple(view.points_board for view in views)
     pixels = tuple(view.pixels for view in views)
     pattern = views[0].pattern if views else ""
-    return FoundBoards(points, pixels, size_px, tuple(range(len(views))), len(views), pattern)
+    return intrinsics.FoundBoards(
+        points, pixels, size_px, tuple(range(len(views))), len(views), pattern
+    )
 
 
 def _tilt_rad(view: BoardView, lens: Lens) -> Float64[np.ndarray, "2"]:

@@ -18,21 +18,7 @@ from dextouch.tactile.layout import Side, TactileLayout
 from services.alignment.calibration.intrinsics import CameraCalibration, calibrate_found
 from services.alignment.calibration.tactile_gain import GloveCalibration, filled_gain
 from services.alignment.calibration.tactile_tare import STATES
-from services.alignment.station_calibration.boards import (
-    SUFFIXES,
-    VIEWS_PER_REGION,
-    BoardView,
-    Coverage,
-    Lens,
-    Photos,
-    camera_coverage,
-    decode_photo,
-    find_board,
-    parse_board,
-    photo_paths,
-    read_photos,
-    reprojection,
-)
+from services.alignment.station_calibration import boards
 from services.alignment.station_calibration.record import (
     Say,
     named_matrix,
@@ -72,10 +58,12 @@ Wait = Callable[[float], None]
 
 def calibrate_photos(options: argparse.Namespace, *, say: Say = print) -> dict[str, object]:
     """Calibrate from the photos of a folder; coverage and advice are written in any case."""
-    paths = photo_paths(options.photos)
+    paths = boards.photo_paths(options.photos)
     if not paths:
-        raise NotFoundError(f"{options.photos}: holds no photo; expected {', '.join(SUFFIXES)}")
-    photos = read_photos(paths, parse_board(options.board))
+        raise NotFoundError(
+            f"{options.photos}: holds no photo; expected {', '.join(boards.SUFFIXES)}"
+        )
+    photos = boards.read_photos(paths, boards.parse_board(options.board))
     coverage, path = write_coverage(photos.views, photos.size_px, options.to, options.camera)
     say(f"board found in {len(photos.views)} of {len(photos)} photos ({photos.pattern})")
     photos.tell_left_out(say)
@@ -96,31 +84,31 @@ def calibrate_photos(options: argparse.Namespace, *, say: Say = print) -> dict[s
     result = calibrate_found(photos.corners())
     for index in sorted(set(range(len(photos.views))) - set(result.used_images)):
         say(f"  corners of {photos.views[index].name} do not fit the others: left out")
-    lens = Lens(result.K, result.distortion)
+    lens = boards.Lens(result.K, result.distortion)
     coverage, _ = write_coverage(photos.views, photos.size_px, options.to, options.camera, lens)
-    residuals = [reprojection(view, lens) for view in photos.views]
+    residuals = [boards.reprojection(view, lens) for view in photos.views]
     picture = residual_picture(photos.views, residuals, photos.size_px)
     write_picture(options.to, f"residuals_{options.camera}.svg", picture)
     return report | keep_camera(result, photos, coverage, options, say=say)
 
 
 def write_coverage(
-    views: Sequence[BoardView],
+    views: Sequence[boards.BoardView],
     size_px: tuple[int, int],
     folder: Path,
     camera: str,
-    lens: Lens | None = None,
-) -> tuple[Coverage, Path]:
+    lens: boards.Lens | None = None,
+) -> tuple[boards.Coverage, Path]:
     """Coverage by these views, and the path of its picture; arguments as `camera_coverage`."""
-    coverage = camera_coverage(views, size_px, lens)
+    coverage = boards.camera_coverage(views, size_px, lens)
     picture = coverage_picture(views, coverage, size_px)
     return coverage, write_picture(folder, f"coverage_{camera}.svg", picture)
 
 
 def keep_camera(
     result: CameraCalibration,
-    photos: Photos,
-    coverage: Coverage,
+    photos: boards.Photos,
+    coverage: boards.Coverage,
     options: argparse.Namespace,
     *,
     say: Say = print,
@@ -132,7 +120,7 @@ def keep_camera(
     name = f"K_{options.camera}"
     facts: dict[str, object] = {
         "camera": options.camera,
-        "board": asdict(parse_board(options.board)),
+        "board": asdict(boards.parse_board(options.board)),
         "num_views": len(result.used_images),
         "fx_fy_cx_cy_px": [fx, fy, cx, cy],
         "sigma_fx_fy_cx_cy_px": sigma.tolist(),
@@ -166,7 +154,7 @@ def keep_camera(
     return facts
 
 
-def read_lens(folder: Path, camera: str) -> tuple[Lens, tuple[int, int]]:
+def read_lens(folder: Path, camera: str) -> tuple[boards.Lens, tuple[int, int]]:
     """OpenCV's lens of a calibrated camera, and width and height of its images (px)."""
     try:
         matrices = read_matrices(folder)
@@ -180,7 +168,7 @@ def read_lens(folder: Path, camera: str) -> tuple[Lens, tuple[int, int]]:
             f"shell: dextouch station calibrate camera --camera {camera} --to {folder}"
         ) from error
     K[:2, 2] -= PIXEL_SHIFT_PX
-    return Lens(K, distortion[0]), (int(width_px), int(height_px))
+    return boards.Lens(K, distortion[0]), (int(width_px), int(height_px))
 
 
 class Session:
@@ -200,13 +188,13 @@ class Session:
     def __init__(
         self, options: argparse.Namespace, live: Path | None = None, *, say: Say = print
     ) -> None:
-        self.views: list[BoardView] = []
-        self.coverage: Coverage | None = None
+        self.views: list[boards.BoardView] = []
+        self.coverage: boards.Coverage | None = None
         self.size_px = (0, 0)
-        self.newest: BoardView | None = None
+        self.newest: boards.BoardView | None = None
         self.hint = ""
         self.todo: tuple[str, ...] = ("hold the board in front of the camera",)
-        self._options, self._board, self._live = options, parse_board(options.board), live
+        self._options, self._board, self._live = options, boards.parse_board(options.board), live
         self._say = say
         self._num_idle = 0
         self._first = 0
@@ -228,9 +216,9 @@ class Session:
 
     def add(self, name: str, data: bytes) -> None:
         """Process one photo or live image."""
-        photo = decode_photo(data, where=name)
+        photo = boards.decode_photo(data, where=name)
         self.size_px = (photo.shape[1], photo.shape[0])
-        view = find_board(name, photo, self._board)
+        view = boards.find_board(name, photo, self._board)
         self.hint, self.newest = self._why_not(view, photo), view
         if view is None or self.hint:
             self._tell(name, self.hint)
@@ -239,7 +227,7 @@ class Session:
             (self._live / f"live_{self._first + len(self.views):04d}.jpg").write_bytes(data)
         self._keep(view)
 
-    def _why_not(self, view: BoardView | None, photo: np.ndarray) -> str:
+    def _why_not(self, view: boards.BoardView | None, photo: np.ndarray) -> str:
         if self._live is None:
             return "no board" if view is None else "blurred, left out" * view.is_blurred
         if view is None:
@@ -258,7 +246,7 @@ class Session:
         elif self._num_idle % TELL_AFTER_IMAGES == 0:
             self._say(why)
 
-    def _keep(self, view: BoardView) -> None:
+    def _keep(self, view: boards.BoardView) -> None:
         self.views.append(view)
         self._num_idle = 0
         options = self._options
@@ -270,7 +258,7 @@ class Session:
         self.coverage, self.todo = coverage, coverage.todo
 
 
-def motion_px(a: BoardView, b: BoardView) -> float:
+def motion_px(a: boards.BoardView, b: boards.BoardView) -> float:
     """Mean displacement of common corners; infinity if there are none."""
     pixels_b = dict(zip(map(tuple, b.points_board.tolist()), b.pixels, strict=True))
     pairs = zip(map(tuple, a.points_board.tolist()), a.pixels, strict=True)
@@ -282,7 +270,7 @@ def folder_arrivals(folder: Path, *, wait: Wait = time.sleep) -> Arrivals:
     """Yield the photos of a folder, then new ones, indefinitely."""
     seen: set[Path] = set()
     while True:
-        for path in photo_paths(folder):
+        for path in boards.photo_paths(folder):
             if path not in seen:
                 seen.add(path)
                 yield path.name, path.read_bytes()
@@ -339,7 +327,7 @@ def live_image(link: HttpLink, camera: str) -> bytes:
 
 
 def coverage_picture(
-    views: Sequence[BoardView], coverage: Coverage, size_px: tuple[int, int]
+    views: Sequence[boards.BoardView], coverage: boards.Coverage, size_px: tuple[int, int]
 ) -> str:
     """Picture of corner positions, board tilts and advice."""
     scale = _WIDTH / size_px[0]
@@ -347,7 +335,7 @@ def coverage_picture(
     image = []
     for (row, column), num_views in np.ndenumerate(coverage.views_by_region):
         x, y = column * width, row * height
-        fill = "#fee2e2" if num_views < VIEWS_PER_REGION else "#f0fdf4"
+        fill = "#fee2e2" if num_views < boards.VIEWS_PER_REGION else "#f0fdf4"
         image += [_box(x, y, width, height, fill), _text(x + 6, y + 16, f"{num_views} views")]
     image += [_dots(view.pixels * scale) for view in views]
     tilts = _polar(coverage.tilts_rad, 110, 60, "tilt of the board: right, down")
@@ -362,7 +350,7 @@ def coverage_picture(
 
 
 def residual_picture(
-    views: Sequence[BoardView], residuals_px: Sequence[np.ndarray], size_px: tuple[int, int]
+    views: Sequence[boards.BoardView], residuals_px: Sequence[np.ndarray], size_px: tuple[int, int]
 ) -> str:
     """Picture of corner residuals, enlarged 100 times, and RMS by photo."""
     scale = _WIDTH / size_px[0]

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float64
 from dextouch.episodes import RecordingReader
 from dextouch.errors import InvalidInputError
 from dextouch.geometry import nearest_index
+from dextouch.hands.robot_hand import NUM_JOINTS
 from dextouch.schemas import (
     SHARED_ATTRIBUTES,
     Domain,
@@ -44,7 +45,6 @@ from services.alignment.synchronization.grid_actions import (
 )
 from services.alignment.synchronization.recorded_streams import (
     Block,
-    Conversion,
     DatedStream,
     EpisodeStream,
     LoadedStream,
@@ -376,11 +376,11 @@ def find_span(
         on_progress(progress_within("placing", number / len(names), name))
         # Pressures of an hour do not fit in memory, the forces of its pads do.
         layout = streams[name].descriptor.tactile_layout
-        of: Conversion = partial(_pad_forces_n, layout) if name in TOUCH_STREAMS else np.asarray
-        parts[name] = _seen(streams[name].load(of))
-        if name not in TOUCH_STREAMS and len(parts[name].t_ns) < MIN_USABLE:
-            # Such as a hand that was never seen.
-            del parts[name]
+        if name in TOUCH_STREAMS:
+            parts[name] = streams[name].load(partial(_pad_forces_n, layout))
+        # Else such as a hand that was never seen.
+        elif len((seen := _seen(streams[name].load())).t_ns) >= MIN_USABLE:
+            parts[name] = seen
     _check_hands(recording, parts)
     # Touch may be missing for a while.
     needed = [name for name in parts if name not in TOUCH_STREAMS]
@@ -454,17 +454,21 @@ def _episode_attributes(
 def check_complete(recording: RecordingReader) -> None:
     """Refuse a recording without any hand or with wrong matrices; raises InvalidInputError."""
     where = f"recording {recording.attributes.recording_id!r}"
-    _check_hands(recording, recording.streams)
+    streams = recording.streams
+    _check_hands(recording, streams)
+    of_actions = (*ACTION_STREAMS[recording.attributes.domain], *commanded_streams(streams))
+    for name in ("joints_measured", "joints_commanded"):
+        if name in of_actions and name in streams and streams[name].shape != (NUM_JOINTS * 2,):
+            raise InvalidInputError(
+                f"{where}: stream {name!r} has samples of {streams[name].shape}, expected the "
+                f"{NUM_JOINTS * 2} joints of both hands in rad, left before right"
+            )
     # One window holds both hands.
     common_layout(
-        [
-            stream.tactile_layout
-            for name, stream in recording.streams.items()
-            if name in TOUCH_STREAMS
-        ],
+        [stream.tactile_layout for name, stream in streams.items() if name in TOUCH_STREAMS],
         what=where,
     )
-    for stream in recording.streams.values():
+    for stream in streams.values():
         check_lens(stream, recording.attributes.calibration, where=where)
 
 
@@ -482,10 +486,12 @@ def _check_hands(recording: RecordingReader, streams: Collection[str]) -> None:
 
 
 def _pad_forces_n(layout: TactileLayout, kpa: np.ndarray) -> Float64[np.ndarray, "n 6"]:
-    """Forces of pads; NaN for samples that miss a taxel."""
-    whole = np.isfinite(kpa).all(axis=1)
-    forces_n = layout.pad_forces_n(np.nan_to_num(kpa))
-    return np.where(whole[:, None], forces_n, np.nan)
+    """Forces of pads; NaN of those that miss a taxel."""
+    is_missing = ~np.isfinite(kpa)
+    forces_n = layout.pad_forces_n(np.where(is_missing, 0.0, kpa))
+    some = is_missing.any(axis=1)
+    forces_n[some] = np.where(layout.by_part(is_missing[some], np.any), np.nan, forces_n[some])
+    return forces_n
 
 
 def _seen(stream: LoadedStream) -> LoadedStream:

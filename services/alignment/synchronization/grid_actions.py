@@ -44,17 +44,21 @@ REST_RAD_S = 0.1
 
 @dataclass(frozen=True)
 class GriddedStreams:
-    """Streams of which actions are made, `TOUCH_STREAMS` as forces (N) of pads, and their grid."""
+    """Streams of which actions are made, and where steps of the grid are `at`.
+
+    `TOUCH_STREAMS` are forces (N) of pads, which are placed each for itself (`pad_forces_n`),
+    across gaps up to `max_gap_ns`, or `TOUCH_GAP_NS` if that is longer.
+    """
 
     grid_ns: Int64[np.ndarray, " n"]
     streams: Mapping[str, LoadedStream]
     at: Mapping[str, GridPlacement]
+    max_gap_ns: int = 0
 
     @property
     def valid(self) -> Bool[np.ndarray, " n"]:
         """Steps at which every stream can be read without reaching across a gap."""
-        needed = [at.valid for name, at in self.at.items() if name not in TOUCH_STREAMS]
-        return np.logical_and.reduce(needed)
+        return np.logical_and.reduce([at.valid for at in self.at.values()])
 
     def poses(self, name: str) -> Float64[np.ndarray, "n 4 4"]:
         """Transforms of a pose stream at the steps; the identity if there is none."""
@@ -65,6 +69,23 @@ class GriddedStreams:
     def vectors(self, name: str) -> Float64[np.ndarray, "n ..."]:
         """Values of a stream, such as joint angles (rad), at the steps."""
         return vectors_on_grid(self.streams[name].values, self.at[name])
+
+    def pad_forces_n(self, side: Side) -> Float64[np.ndarray, "n 6"]:
+        """Forces of a hand's pads at the steps; 0 where none is known, such as in long gaps."""
+        forces_n = np.zeros((len(self.grid_ns), NUM_PADS))
+        if (stream := self.streams.get(f"tactile_{side}")) is None:
+            return forces_n
+        period_ns = stream.descriptor.period_ns()
+        gap_ns = max(stream_gap_ns(self.max_gap_ns, period_ns), TOUCH_GAP_NS)
+        for pad, pad_n in enumerate(stream.values.T):
+            known = np.isfinite(pad_n)
+            t_ns = stream.t_ns[known]
+            at = place_on_grid(t_ns, self.grid_ns, period_ns=period_ns, max_gap_ns=gap_ns)
+            if at.valid.any():
+                # At the edges forces are extrapolated.
+                felt_n = np.maximum(vectors_on_grid(pad_n[known], at), 0.0)
+                forces_n[:, pad] = np.where(at.valid, felt_n, 0.0)
+        return forces_n
 
 
 @dataclass(frozen=True)
@@ -105,12 +126,11 @@ def place_streams(
     """Find the neighbouring samples of every step in every stream, which may be slow."""
     at = {}
     for name, stream in streams.items():
-        period_ns = stream.descriptor.period_ns()
-        gap_ns = stream_gap_ns(max_gap_ns, period_ns)
-        if name in TOUCH_STREAMS:
-            gap_ns = max(gap_ns, TOUCH_GAP_NS)
-        at[name] = place_on_grid(stream.t_ns, grid_ns, period_ns=period_ns, max_gap_ns=gap_ns)
-    return GriddedStreams(grid_ns, streams, at)
+        if name not in TOUCH_STREAMS:
+            period_ns = stream.descriptor.period_ns()
+            gap_ns = stream_gap_ns(max_gap_ns, period_ns)
+            at[name] = place_on_grid(stream.t_ns, grid_ns, period_ns=period_ns, max_gap_ns=gap_ns)
+    return GriddedStreams(grid_ns, streams, at, max_gap_ns)
 
 
 def make_actions(
@@ -181,18 +201,12 @@ def _moved_by_touch(
     for side in SIDES:
         if not {f"wrist_{side}", f"keypoints_{side}"} <= set(gridded.streams):
             continue
-        name = f"tactile_{side}"
-        forces = np.zeros((len(t_s), NUM_PADS))
-        if name in gridded.streams and len(gridded.streams[name].t_ns) > 1:
-            # Where touch is missing, none is known; at the edges forces are extrapolated.
-            felt = np.where(gridded.at[name].valid[:, None], gridded.vectors(name), 0.0)
-            forces = np.maximum(felt, 0.0)
         Ts_world_wrist, joints_rad, offset_m = transfer_by_touch(
             RobotHand(side),
             getattr(tracked, f"Ts_world_wrist_{side}"),
             getattr(tracked, f"joints_{side}_rad"),
             keypoints_m=gridded.vectors(f"keypoints_{side}"),
-            pad_forces_n=forces,
+            pad_forces_n=gridded.pad_forces_n(side),
             t_s=t_s,
         )
         moved |= {f"Ts_world_wrist_{side}": Ts_world_wrist, f"joints_{side}_rad": joints_rad}

@@ -24,6 +24,7 @@ from dextouch.streams import (
     ENCODED_UNITS,
     H264_UNIT,
     HEAD_CAMERA,
+    MAX_MISSING,
     MOUNTS,
     Implausible,
     StreamDescriptor,
@@ -31,6 +32,9 @@ from dextouch.streams import (
     encoded_values,
 )
 from services.alignment.calibration.tactile_tare import (
+    ABSENT,
+    MAX_WRONG_TAXELS,
+    OK,
     REASONS,
     TactileCalibration,
     taxel_faults,
@@ -159,8 +163,10 @@ def date_stream(recording: RecordingReader, name: str) -> DatedStream:
         latency_sigma_ns=_nanoseconds(calibration, f"{name}_latency_sigma_ns"),
     )
     convert: Conversion = np.asarray
-    if descriptor.kind == "tactile" and descriptor.unit != "kPa":
-        return _pressures(DatedStream(recording, descriptor, timing, convert), calibration)
+    if descriptor.kind == "tactile":
+        raw = DatedStream(recording, descriptor, timing, convert)
+        is_done = descriptor.unit == "kPa"
+        return _without_absent(raw) if is_done else _pressures(raw, calibration)
     if descriptor.kind == "keypoints":
         descriptor = descriptor.model_copy(update={"dtype": "float64"})
         side, convert = descriptor.side, partial(np.asarray, dtype=np.float64)
@@ -255,20 +261,38 @@ def _pressures(raw: DatedStream, calibration: dict[str, Matrix]) -> DatedStream:
         glove, (piece.values for piece in raw.pieces()), raw.descriptor.tactile_layout
     )
     refused = unusable_taxels(glove, take)
-    quality = {f"{name}_num_refused_taxels": float(np.count_nonzero(refused))}
-    for state in np.unique(refused[refused > 0]).tolist():
-        quality[f"{name}_num_{REASONS[state]}_taxels"] = float(np.count_nonzero(refused == state))
+    listed = _with_refused(raw, refused)
+    quality = dict(listed.quality)
     if len(take.zero_kpa):
         quality[f"{name}_highest_zero_kpa"] = float(take.zero_kpa.max())
     in_kpa = {"shape": (len(glove.cells),), "dtype": "float32", "unit": "kPa"}
     return replace(
-        raw,
+        listed,
         descriptor=raw.descriptor.model_copy(update=in_kpa),
         convert=partial(glove.to_kpa, refused=refused),
         quality=quality,
         implausible=tuple(take.repeats()),
-        calibration={f"{name}_refused_taxels": matrix_rows(refused[None].astype(np.float64))},
     )
+
+
+def _without_absent(stream: DatedStream) -> DatedStream:
+    """Pressures as they are; those of often missing taxels (`MAX_MISSING`) are zero and listed."""
+    num_missing = sum((~np.isfinite(piece.values)).sum(axis=0) for piece in stream.pieces())
+    is_absent = np.asarray(num_missing > MAX_MISSING * len(stream.t_ns))
+    if not 0 < is_absent.mean() <= MAX_WRONG_TAXELS:
+        return stream
+    listed = _with_refused(stream, np.where(is_absent, ABSENT, OK))
+    return replace(listed, convert=lambda kpa: np.where(is_absent, np.float32(0.0), kpa))
+
+
+def _with_refused(stream: DatedStream, refused: np.ndarray) -> DatedStream:
+    """A glove's stream that counts its refused taxels by reason, and lists them."""
+    name = stream.name
+    quality = {f"{name}_num_refused_taxels": float(np.count_nonzero(refused))}
+    for state in np.unique(refused[refused > 0]).tolist():
+        quality[f"{name}_num_{REASONS[state]}_taxels"] = float(np.count_nonzero(refused == state))
+    states = {f"{name}_refused_taxels": matrix_rows(refused.reshape(1, -1).astype(np.float64))}
+    return replace(stream, quality=quality, calibration=states)
 
 
 def moved_poses(

@@ -13,12 +13,7 @@ from dextouch.clients import PolicyStart
 from dextouch.errors import InvalidInputError, UnknownNameError
 from dextouch.geometry import apply, transform
 from dextouch.geometry.rotations import rotation_from_vector
-from dextouch.hands.actions import (
-    JOINTS_RIGHT,
-    HandTrajectory,
-    actions_from_poses,
-    poses_from_actions,
-)
+from dextouch.hands import actions
 from dextouch.schemas import CHUNK_STEPS, Observation
 from dextouch.streams import HEAD_CAMERA
 
@@ -162,14 +157,14 @@ class ColourServo:
         now = observation.action_reached[-1]
         chunk_index = (observation.first_step + len(observation) - 1) // CHUNK_STEPS
         if self._place_m is None:
-            poses = poses_from_actions(now[None], self._start.anchor)
+            poses = actions.poses_from_actions(now[None], self._start.anchor)
             self._place_m = thing_place_m(
                 observation.images[HEAD_CAMERA][-1],
                 thing,
                 poses.Ts_world_camera_head[0],
                 self._start.K_head,
             )
-            self._open_rad = now[JOINTS_RIGHT].copy()
+            self._open_rad = now[actions.JOINTS_RIGHT].copy()
         feels = bool(observation.tactile_kpa[-1, 1].max() > _FELT_KPA)
         self._gave_up |= chunk_index in _NEEDS_TOUCH and not feels
         if self._place_m is None or chunk_index >= len(plan):
@@ -177,7 +172,7 @@ class ColourServo:
         keys = _GIVE_UP if self._gave_up else plan[chunk_index]
         # Linear interpolation between keys, from the last action sent.
         anchor = self._start.anchor
-        still = poses_from_actions(np.tile(now, (CHUNK_STEPS, 1)), anchor)
+        still = actions.poses_from_actions(np.tile(now, (CHUNK_STEPS, 1)), anchor)
         R_start = anchor.T_world_wrist_right[:3, :3]
         R_world_axes = _axes(R_start)
         grip_m = apply(still.Ts_world_wrist_right[0], np.array([thing.grip_m]))[0]
@@ -189,8 +184,8 @@ class ColourServo:
         grips_m = self._place_m + way[:, :3] @ R_world_axes.T
         wrists = transform(Rs, grips_m - Rs @ np.array(thing.grip_m))
         joints_rad = self._open_rad + way[:, 6:] * _CLOSING_RAD
-        return actions_from_poses(
-            HandTrajectory(
+        return actions.actions_from_poses(
+            actions.HandTrajectory(
                 still.Ts_world_wrist_left,
                 wrists,
                 still.joints_left_rad,

@@ -21,14 +21,9 @@ from dextouch.serving import (
     page_headers,
     serve,
 )
+from services.evaluation.rating import rating_queue
 from services.evaluation.rating.invitations import Invitations, invitation_router
 from services.evaluation.rating.marks import Judgement, Mark, MarkLog, RaterName
-from services.evaluation.rating.rating_queue import (
-    RatedRollout,
-    RatingQueue,
-    RolloutPictures,
-    rated_rollouts,
-)
 from services.evaluation.rating.rating_report import rating_report
 from services.evaluation.rating.rubrics import Rubric, read_rubrics, rubric_of
 from services.evaluation.settings import RatingSettings
@@ -85,10 +80,10 @@ def create_rating_app(settings: RatingSettings) -> FastAPI:
     tasks = settings.tasks or tuple(rubrics)
     for task in tasks:
         rubric_of(task, rubrics)
-    store = EpisodeStore(settings.store_url)
+    store = EpisodeStore(settings.store_url).require_folder()
     marks = MarkLog(settings.marks)
-    rollouts = rated_rollouts(store, tasks, study=settings.study)
-    queue = RatingQueue(
+    rollouts = rating_queue.rated_rollouts(store, tasks, study=settings.study)
+    queue = rating_queue.RatingQueue(
         rollouts,
         marks,
         raters_per_rollout=settings.raters_per_rollout,
@@ -96,7 +91,7 @@ def create_rating_app(settings: RatingSettings) -> FastAPI:
     )
     text = "Marks given since the start, with corrections."
     given = Counter("dextouch_rating_marks", text, registry=None)
-    pictures = RolloutPictures(store)
+    pictures = rating_queue.RolloutPictures(store)
     page = file_router(STATIC, FILES, page_headers(images="'self' blob:"))
     # Not the tasks that rubrics are for, of which a release may bring more.
     of_tasks = ", ".join(sorted(settings.tasks)) or "all tasks"
@@ -122,10 +117,10 @@ def create_rating_app(settings: RatingSettings) -> FastAPI:
 
 
 def rating_router(
-    queue: RatingQueue,
+    queue: rating_queue.RatingQueue,
     marks: MarkLog,
     rubrics: Mapping[str, Rubric],
-    pictures: RolloutPictures,
+    pictures: rating_queue.RolloutPictures,
     *,
     on_mark: Callable[[], object],
 ) -> APIRouter:
@@ -192,7 +187,7 @@ def rating_router(
 
 def agreement_router(
     marks: MarkLog,
-    rollouts: Sequence[RatedRollout],
+    rollouts: Sequence[rating_queue.RatedRollout],
     rubrics: Mapping[str, Rubric],
     raters_per_rollout: int,
 ) -> APIRouter:

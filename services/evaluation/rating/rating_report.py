@@ -13,15 +13,10 @@ from typing import Any, Final, Literal
 import numpy as np
 from jaxtyping import Float64
 
+from services.evaluation import statistics
 from services.evaluation.rating.marks import FIRST, REPEAT, Mark, StoredMark, by_people, vote
 from services.evaluation.rating.rubrics import Rubric, rubric_of
 from services.evaluation.rendering import UNDEFINED
-from services.evaluation.statistics import (
-    Interval,
-    bootstrap_mean_interval,
-    central_interval,
-    start_counts,
-)
 
 Level = Literal["nominal", "interval"]
 LEAST_ALPHA: Final = 0.667
@@ -35,7 +30,7 @@ class RaterBias:
 
     rater: str
     bias: float
-    interval: Interval
+    interval: statistics.Interval
     num_rollouts: int
 
 
@@ -65,7 +60,7 @@ def krippendorff_alpha(ratings: Float64[np.ndarray, "_ _"], *, level: Level) -> 
 
 def alpha_interval(
     ratings: Float64[np.ndarray, "_ _"], generator: np.random.Generator, *, num_draws: int = 1000
-) -> Interval | None:
+) -> statistics.Interval | None:
     """95 % bootstrap interval of alpha of scores: rollouts are drawn, with all of their ratings.
 
     None if alpha is undefined, or is in more than one of twenty draws, as for very few rollouts.
@@ -78,12 +73,12 @@ def alpha_interval(
     centred = np.nan_to_num(rated - np.nanmean(rated))
     total, square = centred.sum(axis=1), (centred**2).sum(axis=1)
     observed = 2 * (num * square - total**2) / (num - 1)
-    counts = start_counts(len(rated), generator, num_draws=num_draws)
+    counts = statistics.start_counts(len(rated), generator, num_draws=num_draws)
     all_num, all_total, all_square = (counts @ one for one in (num, total, square))
     expected = 2 * (all_num * all_square - all_total**2) / (all_num - 1)
     spread = expected > 1e-9 * all_num
     draws = 1 - (counts @ observed)[spread] / expected[spread]
-    return central_interval(draws) if len(draws) > 0.95 * num_draws else None
+    return statistics.central_interval(draws) if len(draws) > 0.95 * num_draws else None
 
 
 def _disagreement(values: np.ndarray, level: Level) -> float:
@@ -116,9 +111,7 @@ def intraclass_correlation(ratings: Float64[np.ndarray, "_ _"]) -> float:
 
 
 def rater_biases(
-    raters: Sequence[str],
-    ratings: Float64[np.ndarray, "_ _"],
-    generator: np.random.Generator,
+    raters: Sequence[str], ratings: Float64[np.ndarray, "_ _"], generator: np.random.Generator
 ) -> list[RaterBias]:
     """Bias of each rater who shares two rollouts with others, with a bootstrap over rollouts."""
     known = np.isfinite(ratings)
@@ -129,8 +122,8 @@ def rater_biases(
         if shared.sum() < 2:
             continue
         differences = ratings[shared, column] - np.nanmean(others[shared], axis=1)
-        counts = start_counts(len(differences), generator, num_draws=1000)
-        interval = central_interval(counts @ differences / len(differences))
+        counts = statistics.start_counts(len(differences), generator, num_draws=1000)
+        interval = statistics.central_interval(counts @ differences / len(differences))
         found.append(RaterBias(rater, float(differences.mean()), interval, len(differences)))
     return found
 
@@ -230,7 +223,7 @@ def _task(marks: list[Mark], rubric: Rubric) -> dict[str, Any]:
     alpha = krippendorff_alpha(scores, level="interval")
     between = alpha_interval(scores, generator)
     means = np.array([np.nanmean(row) for row in scores])
-    interval = bootstrap_mean_interval(means, generator) if len(means) > 1 else None
+    interval = statistics.bootstrap_mean_interval(means, generator) if len(means) > 1 else None
     return {
         "num_rollouts": len(rollouts),
         "num_raters": len(raters),
@@ -266,7 +259,7 @@ def _repeats(people: list[Mark], rubric: Rubric) -> dict[str, Any]:
     return {"num": len(pairs), "same_score": float(np.mean(same)) if same else UNDEFINED}
 
 
-def _comment(alpha: float, between: Interval | None) -> str:
+def _comment(alpha: float, between: statistics.Interval | None) -> str:
     if math.isnan(alpha):
         return (
             "Agreement is undefined: no rollout has two ratings, or all ratings are equal, so "

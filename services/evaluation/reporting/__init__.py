@@ -17,6 +17,7 @@ from dextouch import __version__
 from dextouch.free_text import printable
 from services.evaluation.agreement import FIGURES
 from services.evaluation.rendering import environment
+from services.evaluation.reporting import sections
 from services.evaluation.reporting.pictures import (
     FULL_SCALE_KPA,
     MAX_MOVING,
@@ -28,15 +29,6 @@ from services.evaluation.reporting.pictures import (
     policy_panels,
     scale_colours,
 )
-from services.evaluation.reporting.sections import (
-    ERRORS,
-    clock_rows,
-    comparison_bars,
-    error_rows,
-    failure_rows,
-    tiles,
-    undecided_note,
-)
 
 
 def write_report(report: Mapping[str, Any], pictures: ReportPictures, path: Path) -> None:
@@ -47,17 +39,17 @@ def write_report(report: Mapping[str, Any], pictures: ReportPictures, path: Path
     )
     text = pages.get_template("report.html.j2").render(
         raw_report=report,
-        tiles=tiles(report),
-        errors=error_rows(report.get("errors", {})),
-        error_kinds=ERRORS,
-        clocks=clock_rows(report.get("errors", {})),
+        tiles=sections.tiles(report),
+        errors=sections.error_rows(report.get("errors", {})),
+        error_kinds=sections.ERRORS,
+        clocks=sections.clock_rows(report.get("errors", {})),
         clock_chart=clock_chart(pictures),
         action_charts=action_charts(pictures.actions),
-        comparisons=comparison_bars(report.get("world_model", {})),
+        comparisons=sections.comparison_bars(report.get("world_model", {})),
         policies=policy_panels(report),
         agreement_figures=FIGURES,
-        failures=failure_rows(report),
-        undecided_note=undecided_note,
+        failures=sections.failure_rows(report),
+        undecided_note=sections.undecided_note,
         pictures=pictures,
         moments=moments,
         moving=[moving_picture(pair) for pair in pictures.moving[:MAX_MOVING]],

@@ -66,10 +66,7 @@ def _shapes(pairs: Pairs, title: str) -> list[_Shape]:
         return LEFT + SIDE * x, TOP + SIDE * (1 - y)
 
     bottom = TOP + SIDE
-    shapes = [
-        _label((LEFT, 14.0), 11.0, title),
-        _label((4.0, 31.0), 9.0, "imagined success"),
-    ]
+    shapes = [_label((LEFT, 14.0), 11.0, title), _label((4.0, 31.0), 9.0, "imagined success")]
     for tick in (0.0, 0.25, 0.5, 0.75, 1.0):
         (x, _), (_, y) = at(tick, 0.0), at(0.0, tick)
         shapes += [

@@ -12,19 +12,9 @@ from dextouch.errors import InvalidInputError
 from services.alignment.calibration.hand_eye import solve_robot_base
 from services.alignment.calibration.tactile_tare import TactileCalibration
 from services.alignment.calibration.time_offset import TimeOffset, estimate_tap_offset
+from services.alignment.retargeting import wrist
 from services.alignment.retargeting.hand_retargeter import profile_name
-from services.alignment.retargeting.wrist import (
-    calibrate_wrist,
-    calibration_name,
-    calibration_record,
-    hand_axes_check,
-)
-from services.alignment.station_calibration.camera_views import (
-    Session,
-    calibrate_photos,
-    folder_arrivals,
-    station_arrivals,
-)
+from services.alignment.station_calibration import camera_views
 from services.alignment.station_calibration.record import (
     MATRICES_FILE,
     TakeStream,
@@ -50,18 +40,18 @@ def calibrate(options: argparse.Namespace) -> dict[str, object]:
     if options.watch and options.url is not None:
         raise InvalidInputError("got --watch and --url, expected one of the two")
     if not options.watch and options.url is None:
-        return calibrate_photos(options)
-    session = Session(options, None if options.url is None else options.photos)
+        return camera_views.calibrate_photos(options)
+    session = camera_views.Session(options, None if options.url is None else options.photos)
     print("Ctrl-C ends the collection and calibrates with the photos so far")
     try:
         if options.url is None:
-            session.collect(folder_arrivals(options.photos))
+            session.collect(camera_views.folder_arrivals(options.photos))
         else:
             link = HttpLink(options.url, api_key=options.key)
-            session.collect(station_arrivals(link, options.camera))
+            session.collect(camera_views.station_arrivals(link, options.camera))
     except KeyboardInterrupt:
         print(f"stopped with {len(session.views)} views")
-    return calibrate_photos(options)
+    return camera_views.calibrate_photos(options)
 
 
 def calibrate_base(options: argparse.Namespace) -> dict[str, object]:
@@ -92,8 +82,8 @@ def calibrate_base(options: argparse.Namespace) -> dict[str, object]:
 def measure_wrist(options: argparse.Namespace) -> dict[str, object]:
     """Measure the wrist frame in the axes of a glove's keypoints, from a take of the flat hand."""
     taken, side = _keypoints(options), options.side
-    frame = calibrate_wrist(taken.batch.values, side, where=f"take {options.take!r}")
-    name, sigma_deg = calibration_name(side), float(np.rad2deg(frame.sigma_rad))
+    frame = wrist.calibrate_wrist(taken.batch.values, side, where=f"take {options.take!r}")
+    name, sigma_deg = wrist.calibration_name(side), float(np.rad2deg(frame.sigma_rad))
     facts: dict[str, object] = {
         "side": side,
         "take": options.take,
@@ -102,7 +92,7 @@ def measure_wrist(options: argparse.Namespace) -> dict[str, object]:
         "misfit_mm": frame.misfit_m * 1e3,
         "num_samples": frame.num_samples,
     }
-    record = calibration_record(frame, side)
+    record = wrist.calibration_record(frame, side)
     write_entry(options.to, name, {key: np.array(m) for key, m in record.items()}, facts)
     print(
         f"{name}: known to {sigma_deg:.1f}°; hand of size {frame.size:.2f} (1 is the mean adult), "
@@ -122,7 +112,7 @@ def measure_person(options: argparse.Namespace) -> dict[str, object]:
     calibration = dict(taken.calibration)
     if (options.to / MATRICES_FILE).exists():
         calibration |= read_matrices(options.to)
-    keypoints_m = hand_axes_check(taken.batch.values, side, calibration)
+    keypoints_m = wrist.hand_axes_check(taken.batch.values, side, calibration)
     profile = HandRetargeter(side).measure(keypoints_m)
     name = profile_name(side)
     bones_mm = dict(zip(FINGERS, (profile.bone_m * 1e3).round(1).tolist(), strict=True))
@@ -199,8 +189,7 @@ def _from_taps(glove: TakeStream, tracker: TakeStream) -> TimeOffset:
             layout=stream.layout,
         )
         readings = known.to_kpa(readings)
-    pressure_kpa = readings.astype(np.float64)
-    whole = np.isfinite(pressure_kpa).all(axis=1)
     t_pose_ns, poses = tracker.poses()
-    peaks_kpa = pressure_kpa[whole].max(axis=1)
-    return estimate_tap_offset(t_ns[whole], peaks_kpa, t_pose_ns, poses[:, HEIGHT])
+    peaks_kpa = np.where(np.isfinite(readings), readings, -np.inf).max(axis=1).astype(np.float64)
+    seen = np.isfinite(peaks_kpa)
+    return estimate_tap_offset(t_ns[seen], peaks_kpa[seen], t_pose_ns, poses[:, HEIGHT])

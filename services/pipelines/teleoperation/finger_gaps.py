@@ -36,9 +36,6 @@ class FingerGaps:
                 f"radii of the fingers: got {list(radii.shape)}, expected [{num_fingers}, 3]"
             )
         self._hand = hand
-        self._finger_of_joint = np.repeat(
-            np.arange(num_fingers), [len(finger.joints) for finger in hand.fingers]
-        )
         self._tip_radii_m = radii[:, -1]
         # Pairs of fingers, and of each all pairs of their links, numbered through all fingers.
         self.pairs = np.array(list(combinations(range(num_fingers), 2)), dtype=int).reshape(-1, 2)
@@ -78,7 +75,7 @@ class FingerGaps:
             return joints_rad, stops < 1
         # Each turn stops one further finger at least, and a hand that stands still is admitted.
         while True:
-            shares = np.minimum(SHARES[:, None], stops)[:, self._finger_of_joint]
+            shares = np.minimum(SHARES[:, None], stops)[:, self._hand.finger_of_joint]
             path = joints_rad + shares * step_rad
             gaps_m = self.gaps_m(path)
             is_near = gaps_m < np.minimum(clearance_m, gaps_m[0]) - TOLERANCE_M

@@ -134,9 +134,6 @@ class HandFollower:
         self._upper_rad = self.hand.upper_rad - limits.margin_rad
         self._relaxed_rad = np.clip(0.0, self._lower_rad, self._upper_rad)
         self._gaps = FingerGaps(self.hand, np.array(shape.shape.radii_m))
-        self._finger_of_joint = np.repeat(
-            np.arange(len(self.hand.fingers)), [len(finger.joints) for finger in self.hand.fingers]
-        )
         self.start(self._relaxed_rad)
 
     def start(self, joints_rad: np.ndarray) -> None:
@@ -186,6 +183,9 @@ class HandFollower:
         delay_s = self._ages.delay_s(sample.t_device_ns, t_s)
         if delay_s is None:
             self.refused["time"] += 1
+            if self._retargeter is None:
+                # It may be the one before that was wrong, such as an old one from a cache.
+                self._ages = _SampleAges()
         elif delay_s > self.limits.hold_after_s:
             self.refused["late"] += 1
         elif not np.isfinite(sample.keypoints_m).all(axis=1).any():
@@ -276,7 +276,7 @@ class HandFollower:
         if not result.solved[0].any():
             self.refused["implausible"] += 1
             return None
-        is_new = result.solved[0][self._finger_of_joint]
+        is_new = result.solved[0][self.hand.finger_of_joint]
         self._target_rad = np.where(is_new, result.joints_rad[0], self._target_rad)
         self._tip_error_m = result.tip_error_m[0]
         self._followed, self._fresh_s = sample, fresh_s

@@ -12,13 +12,7 @@ from dextouch.errors import InvalidInputError, NonFiniteError
 from dextouch.schemas import MAX_OBJECTS
 from dextouch.tactile import CONTACT_THRESHOLD_KPA
 from dextouch.tactile.layout import DEXTOUCH_V1, TactileLayout
-from services.world_model.dynamics.core import (
-    NUM_PADS,
-    CoreState,
-    RecurrentCore,
-    SceneFuture,
-    SceneStart,
-)
+from services.world_model.dynamics.core import NUM_PADS, CoreState, RecurrentCore, SceneStart
 from services.world_model.dynamics.features import (
     FREE_KPA,
     NUM_POINTS,
@@ -278,7 +272,15 @@ class DynamicsModel(nn.Module):
         """What all members predict: their states after the commands, and what they say together."""
         members = self.core.members
         future, after = self.core(commands.repeated(members), folded(start), folded(state))
-        run = self._imagined(poses, future, self.core.distance(commands, state.wrist_m[0]))
+        each = unfolded(future, members)
+        taxels = self.core.taxels(future.pattern).view(*each.pattern.shape[:-1], -1)
+        run = _Run(
+            poses=_between(poses, mean_poses(each.objects)),
+            tactile_kpa=self.decode_touch(each.touch.mean(0), taxels.mean(0)).flatten(1, 2),
+            disagreement_m=_spread_m(each.objects),
+            distance=self.core.distance(commands, state.wrist_m[0]),
+            success=each.success.sigmoid(),
+        )
         return unfolded(after, members), run
 
     def _kind_of(self, commands: Commands, start: SceneStart, *_: object) -> tuple[int, int, int]:
@@ -288,18 +290,6 @@ class DynamicsModel(nn.Module):
     def readers(self) -> list[StartReader]:
         """The start reader of every member."""
         return [reader for reader in self.eyes if isinstance(reader, StartReader)]
-
-    def _imagined(self, poses: ObjectPoses, future: SceneFuture, distance: Tensor) -> "_Run":
-        members = self.core.members
-        each = unfolded(future, members)
-        taxels = self.core.taxels(future.pattern).view(*each.pattern.shape[:-1], -1)
-        return _Run(
-            poses=_between(poses, mean_poses(each.objects)),
-            tactile_kpa=self.decode_touch(each.touch.mean(0), taxels.mean(0)).flatten(1, 2),
-            disagreement_m=_spread_m(each.objects),
-            distance=distance,
-            success=each.success.sigmoid(),
-        )
 
     def decode_touch(
         self,

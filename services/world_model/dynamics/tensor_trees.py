@@ -1,5 +1,7 @@
 """Operations on all tensors of nested dataclasses, and traces of functions that take such trees.
 
+All but traces are of arrays of numpy, too.
+
 A trace (torch.jit) has the same operations, which calls from Python make twice as slow.
 """
 
@@ -10,6 +12,7 @@ from dataclasses import fields
 from functools import cache
 from typing import Any, Final, Generic, TypeVar
 
+import numpy as np
 import torch
 from jaxtyping import Bool
 from torch import Tensor, nn
@@ -18,11 +21,12 @@ from torch import Tensor, nn
 _CALLS_BEFORE: Final = 4
 _MOST_TRACES: Final = 16
 _WARM_UP_CALLS: Final = 3
+_LEAF_TYPES: Final = (Tensor, np.ndarray)
 Part = TypeVar("Part")
 Outputs = TypeVar("Outputs")
 
 
-def combined(parts: Sequence[Part], change: Callable[[list[Tensor]], Tensor]) -> Part:
+def combined(parts: Sequence[Part], change: Callable[[list[Any]], Any]) -> Part:
     """One tensor or dataclass from several of a kind: each tensor from theirs of the same name."""
     return named(parts, lambda _, tensors: change(tensors))
 
@@ -34,12 +38,12 @@ def named(parts: Sequence[Part], change: Callable[[str, list[Tensor]], Tensor]) 
     return made
 
 
-def by_name(part: object, name: str = "") -> dict[str, Tensor]:
+def by_name(part: object, name: str = "") -> dict[str, Any]:
     """All tensors of a dataclass by names as those of `named`, below a name."""
     return dict(zip(_names(part, name), _tensors(part), strict=True))
 
 
-def mapped(part: Part, change: Callable[[Tensor], Tensor]) -> Part:
+def mapped(part: Part, change: Callable[[Any], Any]) -> Part:
     """A copy with every tensor changed."""
     return combined([part], lambda tensors: change(tensors[0]))
 
@@ -120,17 +124,17 @@ class Traced(Generic[Outputs]):
         return trace, forms[0]
 
 
-def _tensors(part: Any) -> Iterator[Tensor]:  # noqa: ANN401 - any nesting of dataclasses
+def _tensors(part: Any) -> Iterator[Any]:  # noqa: ANN401 - any nesting of dataclasses
     """All tensors of dataclasses and tuples of these, in the order of their fields."""
-    if isinstance(part, Tensor):
+    if isinstance(part, _LEAF_TYPES):
         yield part
     else:
         for one in _parts(part):
             yield from _tensors(one)
 
 
-def _rebuilt(form: Any, tensors: Iterator[Tensor]) -> Any:  # noqa: ANN401 - any nesting of dataclasses
-    if isinstance(form, Tensor):
+def _rebuilt(form: Any, tensors: Iterator[Any]) -> Any:  # noqa: ANN401 - any nesting of dataclasses
+    if isinstance(form, _LEAF_TYPES):
         return next(tensors)
     parts = [_rebuilt(one, tensors) for one in _parts(form)]
     return tuple(parts) if isinstance(form, tuple) else type(form)(*parts)
@@ -138,7 +142,7 @@ def _rebuilt(form: Any, tensors: Iterator[Tensor]) -> Any:  # noqa: ANN401 - any
 
 def _names(part: Any, name: str = "") -> Iterator[str]:  # noqa: ANN401 - as above
     """Names of the tensors of dataclasses and tuples, in the order of `_tensors`."""
-    if isinstance(part, Tensor):
+    if isinstance(part, _LEAF_TYPES):
         yield name
         return
     named_by = map(str, range(len(part))) if isinstance(part, tuple) else _fields(part.__class__)

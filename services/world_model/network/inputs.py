@@ -29,12 +29,7 @@ from dextouch.hands.actions import CAMERA_HEAD as CAMERA
 from dextouch.hands.robot_hand import chain_points_of_both_m
 from dextouch.schemas import MAX_OBJECTS, ActionKind
 from dextouch.tactile.layout import TactileLayout
-from services.world_model.dynamics.features import (
-    SAMPLE_OFFSETS,
-    SLOT_SIZE,
-    hand_motion,
-    slot_features,
-)
+from services.world_model.dynamics import features
 from services.world_model.network.attention import (
     MIRROR_CAMERA,
     MIRROR_WRIST,
@@ -45,7 +40,7 @@ from services.world_model.network.attention import (
 from services.world_model.network.configuration import FRAMES_PER_LATENT, NetworkConfig, PastChoice
 from services.world_model.network.instruction import NO_WORD, instruction_ids
 
-_PER_SLOT = SLOT_SIZE // len(SAMPLE_OFFSETS) + 6 + 1
+_PER_SLOT = features.SLOT_SIZE // len(features.SAMPLE_OFFSETS) + 6 + 1
 # Of a hand: every slot's features, its box and whether it holds an object; and the side.
 GEOMETRY_SIZE = MAX_OBJECTS * _PER_SLOT + 1
 _PER_M = 10.0
@@ -158,14 +153,14 @@ def contact_geometry(
     actions: Float64[np.ndarray, "time 67"], anchor: AnchorPoses, objects: ObjectsAtStart | None
 ) -> Float32[np.ndarray, "time 2 size"]:
     """Features of every step as of the state model's core, for objects as they first lie."""
-    points_m = torch.from_numpy(hand_motion(actions, anchor).points_m)[:, None]
+    points_m = torch.from_numpy(features.hand_motion(actions, anchor).points_m)[:, None]
     steps = len(points_m)
     slots = torch.zeros(steps, 2, MAX_OBJECTS, _PER_SLOT)
     if objects is not None and len(objects.poses):
         T = torch.from_numpy(transform_from_pose(objects.poses)).float()
         boxes = torch.from_numpy(objects.boxes_m).float()
         count = len(boxes)
-        each = slot_features(
+        each = features.slot_features(
             points_m,
             T[None, :, :3, 3].expand(steps, -1, -1),
             T[None, :, :3, :3].expand(steps, -1, -1, -1),

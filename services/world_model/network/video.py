@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, Float32
 from torch import Tensor, nn
 from torch.nn import functional
 
+from services.world_model.network import conditioning
 from services.world_model.network.attention import (
     NUM_MODULATIONS,
     Block,
@@ -24,15 +25,6 @@ from services.world_model.network.attention import (
     zero_linear,
 )
 from services.world_model.network.codecs import Latents, by_latent
-from services.world_model.network.conditioning import (
-    ACTION_WIDTH,
-    TIME_RANGE,
-    ActionFeatures,
-    Condition,
-    PastCondition,
-    after_first,
-    without_dropped,
-)
 from services.world_model.network.configuration import (
     FLOAT32_PARTS,
     FRAMES_PER_LATENT,
@@ -76,7 +68,7 @@ class VideoExpert(nn.Module):
         self,
         noisy: Latents,
         first: Float32[Tensor, "batch tokens channels"],
-        condition: Condition,
+        condition: conditioning.Condition,
         raster: _Raster,
         past_raster: _PastRaster,
     ) -> Stream:
@@ -96,7 +88,7 @@ class VideoExpert(nn.Module):
         per_token = modulation.repeat_interleave(noisy.shape[2], dim=1)
         return Stream(tokens.flatten(1, 2), per_token, actions=condition.actions)
 
-    def finish(self, stream: Stream, condition: Condition) -> Latents:
+    def finish(self, stream: Stream, condition: conditioning.Condition) -> Latents:
         """Predict the clean latents, or the velocity, as the configuration says."""
         condition = condition.to(self.places.dtype)
         tokens = split_axis(stream.tokens, 1, (condition.vector.shape[1], -1))
@@ -128,9 +120,7 @@ class ViewTokens(nn.Module):
         self.past = nn.Parameter(0.02 * torch.randn(config.past_images, 1, 1, width))
 
     def forward(
-        self,
-        tokens: Float[Tensor, "batch tokens width"],
-        missing: Bool[Tensor, "batch further"],
+        self, tokens: Float[Tensor, "batch tokens width"], missing: Bool[Tensor, "batch further"]
     ) -> Float[Tensor, "batch tokens width"]:
         """Tokens, frame by frame and view by view, with their embeddings."""
         grid = split_axis(tokens, 1, (-1, 1 + len(self.views), self.num_places))
@@ -169,19 +159,21 @@ class WanVideoCondition(nn.Module):
         super().__init__()
         width = config.video_width
         self.embedder: Any = embedder
-        self.actions = two_layers(FRAMES_PER_LATENT * ACTION_WIDTH, width, width)
+        self.actions = two_layers(FRAMES_PER_LATENT * conditioning.ACTION_WIDTH, width, width)
         self.actions[-1] = zero_linear(width, width)
         self.commanded = nn.Parameter(torch.zeros(width))
         self.num_clean = config.num_clean_frames
-        self.past = PastCondition(width) if config.past_images else None
+        self.past = conditioning.PastCondition(width) if config.past_images else None
         self.text_features = TextFeatures(wan)
         self.kept_texts: LastUsed[Text] | None = None
 
-    def constants(self, inputs: ModelInputs, features: ActionFeatures) -> WanConstants:
+    def constants(self, inputs: ModelInputs, features: conditioning.ActionFeatures) -> WanConstants:
         """What does not depend on the flow time."""
         groups = split_axis(features.per_hand[:, 1:, 1], 1, (-1, FRAMES_PER_LATENT)).flatten(2)
         actions = self.actions(groups.to(self.commanded.dtype)).float()
-        actions = after_first(without_dropped(actions, inputs), self.num_clean)
+        actions = conditioning.after_first(
+            conditioning.without_dropped(actions, inputs), self.num_clean
+        )
         if self.past is not None:
             actions = actions + self.past(features.past, groups.shape[1])
         kind = inputs.commanded[:, None, None] * self.commanded.float()
@@ -207,7 +199,7 @@ class WanVideoCondition(nn.Module):
 
     def at(self, constants: WanConstants, t: Float32[Tensor, "batch latents"]) -> WanCondition:
         """Conditions at these times; t is zero where tokens are clean."""
-        waves = self.embedder.timesteps_proj(TIME_RANGE * t.flatten())
+        waves = self.embedder.timesteps_proj(conditioning.TIME_RANGE * t.flatten())
         time = split_axis(self.embedder.time_embedder(waves), 0, tuple(t.shape)) + constants.actions
         project = self.embedder.time_proj
         modulation = project(functional.silu(time).to(project.weight.dtype)).float()

@@ -15,20 +15,7 @@ from torch.nn import functional
 
 from dextouch.geometry import apply, invert
 from services.world_model.network.configuration import Interpolation, RendererConfig
-from services.world_model.rendering.rasters import (
-    MIN_DEPTH_M,
-    BoxHits,
-    SceneStates,
-    base_points_world,
-    box_corners,
-    cast_boxes,
-    colours_at,
-    colours_at_positions,
-    object_transforms,
-    positions_at_start,
-    project_hands,
-    splat_hands,
-)
+from services.world_model.rendering import rasters
 
 FAR_M = 20.0
 # A camera nearer to the plane than this sees it edge-on.
@@ -121,20 +108,20 @@ class Bodies:
     in_front: Bool[np.ndarray, "n points"]
 
     @classmethod
-    def seen(cls, states: SceneStates, boxes_m: np.ndarray, K: np.ndarray) -> "Bodies":
+    def seen(cls, states: rasters.SceneStates, boxes_m: np.ndarray, K: np.ndarray) -> "Bodies":
         """Bodies of states with object boxes [n, k, 6], seen by cameras [n, 3, 3]."""
         T_camera_world = invert(states.Ts_world_camera)
         Ts_object_box = np.tile(np.eye(4), (*boxes_m.shape[:2], 1, 1))
         Ts_object_box[..., :3, 3] = boxes_m[..., :3]
-        Ts_world_box = object_transforms(states.object_poses) @ Ts_object_box
+        Ts_world_box = rasters.object_transforms(states.object_poses) @ Ts_object_box
         Ts_camera_box = T_camera_world[:, None] @ Ts_world_box
-        hands_world = base_points_world(states)
-        corners = box_corners(Ts_camera_box, boxes_m[..., 3:])
+        hands_world = rasters.base_points_world(states)
+        corners = rasters.box_corners(Ts_camera_box, boxes_m[..., 3:])
         hands = apply(T_camera_world, hands_world.reshape(len(states), -1, 3))
         points = np.concatenate([hands, corners.reshape(len(states), -1, 3)], axis=1)
         depth = points[..., 2:]
-        pixels = (points @ np.swapaxes(K, -1, -2))[..., :2] / np.maximum(depth, MIN_DEPTH_M)
-        return cls(Ts_camera_box, hands_world, pixels, depth[..., 0] > MIN_DEPTH_M)
+        pixels = (points @ np.swapaxes(K, -1, -2))[..., :2] / np.maximum(depth, rasters.MIN_DEPTH_M)
+        return cls(Ts_camera_box, hands_world, pixels, depth[..., 0] > rasters.MIN_DEPTH_M)
 
 
 @dataclass(frozen=True)
@@ -143,7 +130,7 @@ class Scenes:
 
     images: UInt8[np.ndarray, "b h w 3"]
     K_head: Float64[np.ndarray, "b 3 3"]
-    states: SceneStates
+    states: rasters.SceneStates
     boxes_m: Float64[np.ndarray, "b k 6"]
 
 
@@ -193,14 +180,14 @@ class PreparedScenes:
 class _ObjectPixels:
     """Object pixels, the start of each image, and the matching start image positions."""
 
-    hits: BoxHits
+    hits: rasters.BoxHits
     owner: Int64[np.ndarray, " n"]
     at_start: Float64[np.ndarray, "hits 2"]
 
 
 def drawing_inputs(
     prepared: PreparedScenes,
-    states: SceneStates,
+    states: rasters.SceneStates,
     owner: Int64[np.ndarray, " n"],
     config: RendererConfig,
 ) -> DrawingInputs:
@@ -211,13 +198,13 @@ def drawing_inputs(
     now = Bodies.seen(states, boxes_m, K)
     motion = CameraMotion.between(K, scenes.states.Ts_world_camera[owner], states.Ts_world_camera)
     present = scenes.states.object_present[owner] & states.object_present
-    points = project_hands(now.hands_world, K, states.Ts_world_camera)
-    hands = splat_hands(points, start.hand_colours[owner], shape_px)
-    hits = cast_boxes(now.Ts_camera_box, boxes_m[..., 3:], present, K, shape_px)
+    points = rasters.project_hands(now.hands_world, K, states.Ts_world_camera)
+    hands = rasters.splat_hands(points, start.hand_colours[owner], shape_px)
+    hits = rasters.cast_boxes(now.Ts_camera_box, boxes_m[..., 3:], present, K, shape_px)
 
     positions = motion.image_positions(shape_px)
     warped, marks, outside = _warped(start, owner, positions, config)
-    at_start = positions_at_start(hits, before.Ts_camera_box[owner], boxes_m[..., 3:], K)
+    at_start = rasters.positions_at_start(hits, before.Ts_camera_box[owner], boxes_m[..., 3:], K)
     seen = _ObjectPixels(hits, owner, at_start)
     objects = _objects(seen, start)
     fine = [warped, objects[:, :3], hands.colour, hands.coverage, objects[:, 3:], marks, outside]
@@ -246,18 +233,20 @@ def _start(scenes: Scenes, before: Bodies) -> _Start:
     shape = len(scenes.images), *scenes.images.shape[1:3]
     rgb = np.ascontiguousarray(np.moveaxis(scenes.images, -1, 1), dtype=np.float32) / 255.0
     K, cameras = scenes.K_head, scenes.states.Ts_world_camera
-    points = project_hands(before.hands_world, K, cameras)
-    colours = colours_at(rgb, project_hands(before.hands_world, K, cameras, middle_only=True))
-    hands = splat_hands(points, colours, shape[1:]).coverage
+    points = rasters.project_hands(before.hands_world, K, cameras)
+    colours = rasters.colours_at(
+        rgb, rasters.project_hands(before.hands_world, K, cameras, middle_only=True)
+    )
+    hands = rasters.splat_hands(points, colours, shape[1:]).coverage
     present = scenes.states.object_present
-    hits = cast_boxes(before.Ts_camera_box, scenes.boxes_m[..., 3:], present, K, shape[1:])
+    hits = rasters.cast_boxes(before.Ts_camera_box, scenes.boxes_m[..., 3:], present, K, shape[1:])
     shown = np.zeros(shape, dtype=np.int64)
     shown.reshape(-1)[hits.place] = hits.slot + 1
     covered = [rgb, hands.max(axis=1, keepdims=True), (shown[:, None] > 0).astype(np.float32)]
     return _Start(np.concatenate(covered, axis=1), hands, shown, colours)
 
 
-def _plane(hits: BoxHits, values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+def _plane(hits: rasters.BoxHits, values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """Scatter values of hits [hits, c] into images [n, c, h, w]; zero elsewhere."""
     num_images, height, width = shape
     flat = np.zeros((num_images * height * width, values.shape[1]), dtype=np.float32)
@@ -282,7 +271,7 @@ def _warped(
 
 def _objects(seen: _ObjectPixels, start: _Start) -> Float32[np.ndarray, "n 4 h w"]:
     """Objects in the start image's colours, and their mask."""
-    texture = colours_at_positions(start.rgb, seen.owner[seen.hits.image], seen.at_start)
+    texture = rasters.colours_at_positions(start.rgb, seen.owner[seen.hits.image], seen.at_start)
     values = np.concatenate([texture, np.ones((len(texture), 1))], axis=1)
     return _plane(seen.hits, values, (len(seen.owner), *start.rgb.shape[2:]))
 
@@ -290,7 +279,7 @@ def _objects(seen: _ObjectPixels, start: _Start) -> Float32[np.ndarray, "n 4 h w
 def _coarse(
     seen: _ObjectPixels,
     start: _Start,
-    states: SceneStates,
+    states: rasters.SceneStates,
     boxes_m: np.ndarray,
     hands_nearness: np.ndarray,
 ) -> Float32[np.ndarray, "n 13 rows cols"]:
@@ -301,9 +290,9 @@ def _coarse(
     kept = np.flatnonzero((u % 2 == 0) & (v % 2 == 0))
     image, slot = hits.image[kept], hits.slot[kept]
     hidden = start.layers[:, 3:4]
-    upwards = object_transforms(states.object_poses[image, slot])[..., 2, :3]
+    upwards = rasters.object_transforms(states.object_poses[image, slot])[..., 2, :3]
     values = [
-        colours_at_positions(hidden, owner[image], seen.at_start[kept]),
+        rasters.colours_at_positions(hidden, owner[image], seen.at_start[kept]),
         hits.thickness_m[kept, None] * _PER_M,
         _NEARNESS_M / hits.depth_m[kept, None],
         hits.local[kept],

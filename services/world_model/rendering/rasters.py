@@ -3,10 +3,8 @@
 Objects are boxes, by casting rays; hands are ribbons of coloured points along their bones.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cache
-from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int64
@@ -14,8 +12,8 @@ from jaxtyping import Bool, Float, Float32, Float64, Int64
 from dextouch.geometry import apply, invert, transform_from_pose
 from dextouch.hands.actions import JOINTS_LEFT, JOINTS_RIGHT, AnchorPoses, poses_from_actions
 from dextouch.hands.robot_hand import chain_points_of_both_m
+from services.world_model.dynamics.tensor_trees import mapped
 
-Arrays = TypeVar("Arrays")
 # Slots of the renderer's inputs, which its weights are trained with; one more than tasks may have.
 MAX_DRAWN_OBJECTS = 4
 # Minimum half size of a box; thinner boxes are drawn this thick.
@@ -81,21 +79,7 @@ class SceneStates:
 
     def take(self, rows: Int64[np.ndarray, " m"] | slice) -> "SceneStates":
         """Select states, in the order of `rows`."""
-        return SceneStates(*(getattr(self, field.name)[rows] for field in fields(self)))
-
-
-def joined(parts: Sequence[Arrays]) -> Arrays:
-    """One array, or dataclass of arrays, from several of a kind: their first axes concatenated."""
-    first: Any = parts[0]
-    if len(parts) == 1:
-        together = first
-    elif isinstance(first, np.ndarray):
-        together = np.concatenate(list[Any](parts))
-    else:
-        names = [field.name for field in fields(first)]
-        together = type(first)(*[joined([getattr(part, name) for part in parts]) for name in names])
-    made: Arrays = together
-    return made
+        return mapped(self, lambda values: values[rows])
 
 
 @dataclass(frozen=True)

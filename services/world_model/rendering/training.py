@@ -1,7 +1,7 @@
 """Training of the renderer on ground-truth states, some with the pose noise of predicted ones."""
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,9 +10,11 @@ from jaxtyping import Float32, Float64, Int64, UInt8
 from torch import Tensor
 from torch.nn import functional
 
+from dextouch.command_line import ProgressLines
 from dextouch.errors import InvalidInputError
 from dextouch.geometry.rotations import quaternion_from_rotation, rotation_from_vector
 from services.networks.optimizer import Budget, OptimizerLoop, update_average
+from services.world_model.dynamics.tensor_trees import combined
 from services.world_model.network.configuration import RendererConfig
 from services.world_model.rendering.inputs import (
     DrawingInputs,
@@ -20,7 +22,7 @@ from services.world_model.rendering.inputs import (
     Scenes,
     drawing_inputs,
 )
-from services.world_model.rendering.rasters import SceneStates, joined, object_transforms
+from services.world_model.rendering.rasters import SceneStates, object_transforms
 from services.world_model.rendering.renderer import RendererNetwork, has_fast_bfloat16
 from services.world_model.settings import RendererTraining
 
@@ -29,7 +31,6 @@ _EDGE_WINDOW_PX = 7
 _LATE_START_SHARE = 0.5
 # Chosen: rotation noise (rad) on each axis, beside `shake_m` of position noise.
 _SHAKE_RAD = 0.05
-OnProgress = Callable[[float, int, float], None]
 
 
 @dataclass(frozen=True)
@@ -52,14 +53,13 @@ def train_renderer(
     settings: RendererTraining,
     *,
     rng: np.random.Generator,
-    on_progress: OnProgress | None = None,
+    title: str = "",
     initial: RendererNetwork | None = None,
 ) -> tuple[RendererNetwork, float]:
     """Train on pairs of images of one clip: a start image and a target image.
 
-    `rng` draws initial weights (but those of `initial`), pairs and pose noise. `on_progress` is
-    called after each step with the completed share, the step and the loss. Returns the averaged
-    network and CPU seconds.
+    `rng` draws initial weights (but those of `initial`), pairs and pose noise. With a `title`,
+    progress is shown. Returns the averaged network and CPU seconds.
 
     Raises:
         InvalidInputError: no clips, several sizes of images, or unsupported sides.
@@ -68,12 +68,13 @@ def train_renderer(
     if initial is not None:
         run.network.load_state_dict(initial.state_dict())
     budget = Budget(settings.cpu_budget_s, settings.max_steps)
+    lines = ProgressLines(title, has_bar=False)
     averaged = copy.deepcopy(run.network).eval().requires_grad_(requires_grad=False)
     for loss in OptimizerLoop(run.network, settings.options(), budget).run(run.loss):
         weights = averaged.parameters(), run.network.parameters()
         update_average(*weights, decay=settings.ema_decay, num_updates=budget.step - 1)
-        if on_progress is not None:
-            on_progress(min(budget.share(), 1.0), budget.step, loss)
+        if title:
+            lines.show(f"{min(budget.share(), 1.0):.0%}  step {budget.step}  loss {loss:.4f}")
     return averaged, budget.cpu_s
 
 
@@ -179,4 +180,4 @@ def gather(clips: Sequence[SceneClip], rows: Int64[np.ndarray, "b 2"]) -> Scenes
     images = np.stack([clips[clip].images[image] for clip, image in rows])
     states = [clips[clip].states.take(slice(i, i + 1)).padded(num_slots) for clip, i in rows]
     K_head = np.stack([clips[clip].K_head for clip, _ in rows])
-    return Scenes(images, K_head, joined(states), boxes_m)
+    return Scenes(images, K_head, combined(states, np.concatenate), boxes_m)

@@ -6,6 +6,8 @@ from collections.abc import Collection, Iterable, Sequence
 from functools import partial
 from typing import TypeAlias, TypeVar
 
+import structlog
+
 from dextouch.episodes import EpisodeGrid, data_hash, split_by_scene
 from dextouch.errors import ConflictError, InvalidInputError
 from dextouch.schemas import Domain
@@ -18,6 +20,7 @@ from services.world_model.training.joint_dataset import StoredEpisode, TrainingE
 # An episode of either form of the world model.
 DomainEpisode: TypeAlias = EpisodeGrid | TrainingEpisode
 D = TypeVar("D", bound=DomainEpisode)
+logger = structlog.get_logger(__name__)
 
 
 def subset_by_hash(episodes: Sequence[D], count: int | None, *, what: str) -> list[D]:
@@ -35,6 +38,16 @@ def subset_by_hash(episodes: Sequence[D], count: int | None, *, what: str) -> li
 
     chosen = sorted(range(len(episodes)), key=place)[:count]
     return [episodes[index] for index in sorted(chosen)]
+
+
+def outside_scenes(people: Sequence[D], heldout: Sequence[DomainEpisode]) -> list[D]:
+    """Episodes of people in other scenes than the held-out ones; the others are counted."""
+    scenes = {episode.scene for episode in heldout}
+    kept = [episode for episode in people if episode.scene not in scenes]
+    if len(kept) < len(people):
+        reason = "people in scenes that are held out of the robots'"
+        logger.warning("skipped_episodes", reason=reason, count=len(people) - len(kept))
+    return kept
 
 
 def check_stores(urls: Iterable[str], ids: Iterable[str], rates_hz: Collection[float]) -> None:
@@ -135,7 +148,7 @@ def load_split(
         people += read(url, domain="human")
     together = [
         *trained,
-        *subset_by_hash(people, settings.human_episodes, what="human"),
+        *subset_by_hash(outside_scenes(people, heldout), settings.human_episodes, what="human"),
     ]
     rates_hz = {episode.model_rate_hz for episode in (*together, *heldout)}
     ids = [episode.episode_id for episode in together]

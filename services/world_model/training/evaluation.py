@@ -15,13 +15,14 @@ from dextouch.metrics import image as image_metrics
 from dextouch.metrics import tactile as tactile_metrics
 from dextouch.schemas import CHUNK_STEPS, ActionKind
 from dextouch.tactile.layout import DEXTOUCH_V1, TactileLayout
+from services.world_model.checkpoints import StateBounds
 from services.world_model.dynamics.features import STEPS_PER_LATENT
 from services.world_model.dynamics.model import DynamicsModel, ImaginedSteps, batched
 from services.world_model.network.codecs import to_uint8, to_unit
 from services.world_model.network.inputs import PredictionRequest, build_inputs
 from services.world_model.network.model import JointWorldModel, stack_noise
 from services.world_model.training import joint_dataset
-from services.world_model.training.reader_training import reader_errors
+from services.world_model.training.member_training import reader_errors
 from services.world_model.training.scene_table import SceneTable
 
 BATCH = 24
@@ -66,18 +67,8 @@ def evaluate_prediction(
         InvalidInputError: an episode that was trained on, or no window at all.
     """
     refuse_trained(episodes, train_fingerprints, "the model")
-    places = [
-        (episode, start)
-        for episode in episodes
-        for start in joint_dataset.window_starts(episode, model.config.max_steps).tolist()
-        if start % stride == 0
-    ]
-    if not places:
-        raise InvalidInputError(
-            f"evaluation: got {len(episodes)} episodes without a window of "
-            f"{model.config.max_steps} steps, expected at least one"
-        )
     steps = model.config.max_steps
+    places = evaluated_places(episodes, steps, stride)
     windows = [_cut(episode, start, steps, action_kind) for episode, start in places]
     truth = Futures(
         np.stack([w.images[1:] for w in windows]),
@@ -117,6 +108,27 @@ def evaluate_prediction(
     if not model.config.use_touch:
         figures = {name: value for name, value in figures.items() if name.startswith("psnr")}
     return {**figures, "num_windows": float(len(windows))}
+
+
+def evaluated_places(
+    episodes: Sequence[joint_dataset.EpisodeArrays], num_steps: int, stride: int
+) -> list[tuple[joint_dataset.EpisodeArrays, int]]:
+    """Episodes and first steps of the windows that start at a multiple of `stride`.
+
+    Raises InvalidInputError if there is none.
+    """
+    places = [
+        (episode, start)
+        for episode in episodes
+        for start in joint_dataset.window_starts(episode, num_steps).tolist()
+        if start % stride == 0
+    ]
+    if not places:
+        raise InvalidInputError(
+            f"evaluation: got {len(episodes)} episodes without a window of {num_steps} steps, "
+            "expected at least one"
+        )
+    return places
 
 
 def refuse_trained(
@@ -216,29 +228,17 @@ def _figures(predicted: Futures, true: Futures, suffix: str) -> dict[str, float]
     }
 
 
-@dataclass(frozen=True)
-class StateFigures:
-    """Measured accuracy, with the bounds that almost no held-out chunk exceeds.
+def evaluate_dynamics(
+    dynamics: DynamicsModel, table: SceneTable
+) -> tuple[dict[str, float], StateBounds]:
+    """Predict every episode from its first step and from later ones, and compare.
 
-    `figures` hold errors of readers (first member) and objects (median at a chunk's end) in mm, and
-    contact F1 and error of touch by chunks of 16 steps. Names with `from_16` are of starts at step
-    16.
+    Returns errors of readers (first member) and objects (median at a chunk's end) in mm, contact F1
+    and error of touch by chunks of 16 steps (names with `from_16` are of starts at step 16), and
+    the bounds that almost no held-out chunk exceeds.
     """
-
-    figures: dict[str, float]
-    disagreement_m: float
-    distance: float
-
-
-def evaluate_dynamics(dynamics: DynamicsModel, table: SceneTable) -> StateFigures:
-    """Predict every episode from its first step and from later ones, and compare."""
     figures: dict[str, float] = {}
     disagreement_m, distance = [], []
-    if int(table.length.max()) <= CHUNK_STEPS:
-        raise InvalidInputError(
-            f"state model: the longest held-out episode has {int(table.length.max())} steps, "
-            f"expected more than the {CHUNK_STEPS} of a chunk"
-        )
     last_start = table.num_steps - 1 - STEPS_PER_LATENT
     for start in (s for s in STARTS if s in table.image_steps and s <= last_start):
         imagined = _imagined(dynamics, table, start)
@@ -248,11 +248,21 @@ def evaluate_dynamics(dynamics: DynamicsModel, table: SceneTable) -> StateFigure
         within = table.within(torch.arange(len(table)), start)
         disagreement_m.append(chunk_peaks(imagined.disagreement_m, within))
         distance.append(chunk_peaks(imagined.distance, within))
-    return StateFigures(
-        {name: round(float(value), 4) for name, value in figures.items()},
+    rounded = {name: round(float(value), 4) for name, value in figures.items()}
+    return rounded, StateBounds(
         disagreement_m=float(torch.cat(disagreement_m).quantile(_BOUND_QUANTILE)),
         distance=max(_SMALLEST_DISTANCE, float(torch.cat(distance).quantile(_BOUND_QUANTILE))),
+        of_chunks=True,
     )
+
+
+def check_long_enough(heldout: SceneTable) -> None:
+    """Raise InvalidInputError, hours early, if no held-out episode has a whole chunk."""
+    if int(heldout.length.max()) <= CHUNK_STEPS:
+        raise InvalidInputError(
+            f"state model: the longest held-out episode has {int(heldout.length.max())} steps, "
+            f"expected more than the {CHUNK_STEPS} of a chunk; hold out others with --heldout STORE"
+        )
 
 
 def chunk_peaks(

@@ -2,10 +2,10 @@
 
 import hashlib
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Generator, Iterable, Sequence
+from collections.abc import Collection, Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import lru_cache
-from typing import Any, Final, TypeAlias, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 import torch
@@ -33,8 +33,6 @@ from services.world_model.network.inputs import (
     PredictionRequest,
 )
 
-# What an episode must have for windows to be cut from it.
-CUT: Final = (needs.EVERY_PART, needs.EVERY_IMAGE)
 # Open readers per process; each holds an episode's timestamps and actions.
 MAX_OPEN_READERS = 512
 # Chosen: half of the windows of episodes that have commanded actions have these, since policies
@@ -433,6 +431,19 @@ class WindowSampler:
         )
 
 
+def _selected(
+    store: EpisodeStore, splits: Collection[Split], domain: Domain | None, image_px: int | None
+) -> Iterator[EpisodeReader]:
+    """Episodes that windows can be cut from; raises as `select_episodes`."""
+    large = needs.Need(
+        f"with images below {image_px} px",
+        "record larger ones, or choose a smaller --network.image-px",
+        lambda reader: image_px is None or min(reader.streams[HEAD_CAMERA].shape[:2]) >= image_px,
+    )
+    required = (needs.EVERY_PART, needs.EVERY_IMAGE, large)
+    return select_episodes([store], domain=domain, splits=splits, needs=required)
+
+
 def load_episodes(
     url: str,
     *,
@@ -442,7 +453,7 @@ def load_episodes(
     further_views: Sequence[str] = (),
 ) -> list[EpisodeArrays]:
     """Episodes of a store in memory; raises as `select_episodes` and `read_episode`."""
-    readers = select_episodes([EpisodeStore(url)], domain=domain, splits=splits, needs=CUT)
+    readers = _selected(EpisodeStore(url), splits, domain, image_px)
     return [read_episode(one, image_px=image_px, further_views=further_views) for one in readers]
 
 
@@ -458,7 +469,7 @@ def index_episodes(
     # The episode of an id may have changed since it was last read.
     _reader.cache_clear()
     store, indexed = EpisodeStore(url), list[StoredEpisode]()
-    for found in select_episodes([store], domain=domain, splits=splits, needs=CUT):
+    for found in _selected(store, splits, domain, image_px):
         # The cached reader, so that processes forked later inherit it open.
         arrays = read_episode(
             _reader(url, found.item_id), image_px=image_px, further_views=further_views

@@ -33,14 +33,12 @@ from services.world_model.pretrained_video import (
     is_pretrained,
     share_texts,
 )
-from services.world_model.training import episode_sets, joint_dataset, resume_files
+from services.world_model.training import episode_sets, joint_dataset, joint_objective, resume_files
 from services.world_model.training.distribution import ALONE, Processes, load_whole, whole_weights
-from services.world_model.training.evaluation import evaluate_prediction, refuse_trained
-from services.world_model.training.joint_objective import (
-    LossOptions,
-    errors,
-    examples_of,
-    own_context,
+from services.world_model.training.evaluation import (
+    evaluate_prediction,
+    evaluated_places,
+    refuse_trained,
 )
 from services.world_model.training.latent_cache import use_latent_cache
 from services.world_model.training.tokenizer_trainer import check_unseen, with_tokenizer
@@ -264,11 +262,11 @@ class TrainingRun:
         """One optimizer step; returns the video and tactile losses."""
         settings, num_parts = self.settings.optimizer, self.settings.accumulate
         if self.settings.self_forcing:
-            batch = own_context(
+            batch = joint_objective.own_context(
                 self.model, batch, generator=self._generator, processes=self.processes
             )
         windows = self.settings.windows
-        options = LossOptions(
+        options = joint_objective.LossOptions(
             windows.context_noise,
             settings.touch_loss,
             settings.precision,
@@ -277,7 +275,7 @@ class TrainingRun:
             text_dropout=windows.text_dropout,
             action_dropout=windows.action_dropout,
         )
-        examples = examples_of(
+        examples = joint_objective.examples_of(
             self.model,
             batch,
             generator=self._generator,
@@ -288,7 +286,7 @@ class TrainingRun:
         self.loop.optimizer.zero_grad()
         both = torch.zeros(2, device=examples.t.device)
         for part in examples.parts(num_parts):
-            loss = errors(self.model, part, settings.precision)
+            loss = joint_objective.errors(self.model, part, settings.precision)
             torch.autograd.backward(loss.video + settings.tactile_weight * loss.tactile)
             both += torch.stack([loss.video, loss.tactile]).detach()
         self.loop.step(video=both[0], touch=both[1])
@@ -380,6 +378,8 @@ def train_on(
 ) -> TrainingReport | None:
     """`train` with episodes that are already split."""
     episode_sets.check_disjoint(trained, heldout)
+    # Before training, so that too short ones are found at once.
+    evaluated_places(heldout, settings.network.max_steps, settings.evaluation_stride)
     settings, tokenizer = with_tokenizer(settings)
     settings, layouts = settings.with_adapters(), [e.tactile_layout for e in (*trained, *heldout)]
     layout = common_layout(layouts, what="training episodes")
@@ -387,7 +387,8 @@ def train_on(
         known = settings.network.tactile_layout
         common_layout([known, layout], what="--tokenizer and the training episodes")
         check_unseen(heldout, tokenizer)
-    settings = settings.model_copy(update={"network": settings.network.with_layout(layout)})
+    network = _at_rate(settings, trained[0].model_rate_hz).with_layout(layout)
+    settings = settings.model_copy(update={"network": network})
     torch.set_num_threads(settings.num_threads)
     ancestor = None if settings.init is None else checkpoints.read_checkpoint(settings.init)
     known_tasks: set[str] = set()
@@ -437,6 +438,20 @@ def train_on(
     )
 
 
+def _at_rate(settings: TrainSettings, rate_hz: float) -> NetworkConfig:
+    """The configuration at the rate of the episodes; ConflictError if another one is requested."""
+    network = settings.network
+    if "model_rate_hz" in network.model_fields_set and network.model_rate_hz != rate_hz:
+        has, advice = "--network.model-rate-hz is", "leave it out, or align them at that rate"
+        if settings.init is not None:
+            has, advice = f"{settings.init} has steps at", "align them at its rate"
+        raise ConflictError(
+            f"training: {has} {network.model_rate_hz:g} Hz, the episodes have steps at "
+            f"{rate_hz:g} Hz; {advice}"
+        )
+    return network.model_copy(update={"model_rate_hz": rate_hz})
+
+
 def _metadata(
     settings: TrainSettings,
     network: NetworkConfig,
@@ -451,6 +466,7 @@ def _metadata(
     names = {episode.episode_id for episode in trained}
     windows = settings.windows
     dropped = checkpoints.dropout_shares(windows.text_dropout, windows.action_dropout, ancestor)
+    of_views = windows.view_dropout or (before.view_dropout if before else 0.0)
     return checkpoints.CheckpointMetadata(
         name=settings.name,
         network=network,
@@ -478,7 +494,7 @@ def _metadata(
         tokenizer_digest=before.tokenizer_digest if before else None,
         text_dropout=dropped[0],
         action_dropout=dropped[1],
-        view_dropout=checkpoints.view_dropout(windows.view_dropout, network, before),
+        view_dropout=of_views if network.further_views else 0.0,
     )
 
 

@@ -37,8 +37,13 @@ from dextouch.tactile.layout import DEXTOUCH_V1, common_layout
 from services.world_model.checkpoints import learned_tasks
 from services.world_model.dynamics.features import DynamicsConfig
 from services.world_model.settings import StateTrainSettings
-from services.world_model.training.episode_sets import check_stores, check_tasks, subset_by_hash
-from services.world_model.training.scene_table import vocabulary
+from services.world_model.training.episode_sets import (
+    check_stores,
+    check_tasks,
+    outside_scenes,
+    subset_by_hash,
+)
+from services.world_model.training.scene_table import usual_boxes_m, vocabulary
 from services.world_model.training.transfer import Base
 
 logger = structlog.get_logger(__name__)
@@ -260,11 +265,7 @@ def load_state_data(settings: StateTrainSettings) -> StateData:
     training = subset_by_hash(training, settings.robot_episodes, what="robot")
     if settings.human and settings.human_episodes != 0:
         people = load(*settings.human, splits=settings.splits, domain="human")
-        scenes, num_people = {episode.scene for episode in heldout}, len(people)
-        people = [episode for episode in people if episode.scene not in scenes]
-        if len(people) < num_people:
-            reason = "people in scenes that are held out of the robots'"
-            logger.warning("skipped_episodes", reason=reason, count=num_people - len(people))
+        people = outside_scenes(people, heldout)
         training += subset_by_hash(people, settings.human_episodes, what="human")
     if len({episode.domain for episode in training}) > 1:
         heldout = [episode for episode in heldout if episode.domain == "robot"]
@@ -315,11 +316,16 @@ def _correct_grips(episodes: Sequence[EpisodeGrid]) -> None:
 
 
 def check_new(data: StateData, settings: StateTrainSettings, base: Base | None) -> None:
-    """Check tasks as `check_tasks`; what is held out, the initial checkpoint has not seen."""
+    """Check rate, and tasks as `check_tasks`; the initial checkpoint has seen none held out."""
     if base is None:
         check_tasks(data.episodes, settings)
         return
-    about = base.checkpoint.metadata
+    about, rate_hz = base.checkpoint.metadata, data.training[0].about.model_rate_hz
+    if rate_hz != about.model_rate_hz:
+        raise InvalidInputError(
+            f"training: the initial checkpoint has steps at {about.model_rate_hz:g} Hz, the "
+            f"episodes at {rate_hz:g} Hz; align them at its rate (`--options.model-rate-hz`)"
+        )
     check_tasks(data.episodes, settings, {*about.dynamics.tasks, *learned_tasks(about.sets)})
     if about.dynamics.has_humans and {one.domain for one in data.training} == {"human"}:
         raise InvalidInputError(
@@ -340,10 +346,18 @@ def configured(
     """The configuration of a model of some episodes, which may start from another model.
 
     Raises:
-        InvalidInputError: several image sizes or lists of objects, or tasks that are not trained.
+        InvalidInputError: several image sizes or lists of objects, objects of unknown size, or
+            tasks that are not trained.
     """
     episodes = data.episodes
     tasks, num_objects = vocabulary(episodes)
+    boxes_m = usual_boxes_m(episodes)
+    counts = zip(tasks, num_objects, strict=True)
+    if boxless := [task for task, count in counts if len(boxes_m[task]) != count]:
+        raise InvalidInputError(
+            f"training: the sizes of the objects of tasks {boxless} are not known; give their "
+            "boxes by --clicks FILE (docs/objects.md), or in the episodes (`object_boxes_m`)"
+        )
     domains = {episode.domain for episode in data.training}
     untrained = set(tasks) - {episode.task for episode in data.training}
     if untrained:
@@ -385,10 +399,11 @@ def _instructions(
     return tuple(sorted(sentences))
 
 
-def drawn_episodes(data: StateData) -> Sequence[EpisodeGrid]:
-    """Episodes that a renderer is trained on: of robots, as rollouts are, if there are any."""
-    robots = [episode for episode in data.training if episode.domain == "robot"]
-    return robots or data.training
+def drawn_episodes(data: StateData, settings: StateTrainSettings) -> list[EpisodeGrid]:
+    """Labelled episodes that a renderer is trained on: of robots, as rollouts are, if any are."""
+    mask = labelled_episodes(data.training, settings)
+    known = [one for one, is_labelled in zip(data.training, mask, strict=True) if is_labelled]
+    return [episode for episode in known if episode.domain == "robot"] or known
 
 
 def check_drawable(episodes: Sequence[EpisodeGrid]) -> None:

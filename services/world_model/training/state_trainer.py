@@ -11,10 +11,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
 from torch import Tensor, nn
 
-from dextouch.command_line import ProgressLines
 from dextouch.episodes import data_hash
 from dextouch.errors import InvalidInputError
 from dextouch.jobs import worker_pool
@@ -33,10 +32,9 @@ from services.world_model.dynamics.start_reader import Reading, StartReader
 from services.world_model.rendering.renderer import RendererNetwork, uses_bfloat16
 from services.world_model.rendering.training import train_renderer
 from services.world_model.settings import StateAdaptSettings, StateTrainSettings, recorded_command
-from services.world_model.training import core_training, state_data
+from services.world_model.training import member_training, state_data
 from services.world_model.training.episode_sets import training_sets
-from services.world_model.training.evaluation import evaluate_dynamics
-from services.world_model.training.reader_training import OnStep, read_step, train_reader
+from services.world_model.training.evaluation import check_long_enough, evaluate_dynamics
 from services.world_model.training.scene_table import (
     SceneTable,
     scene_clips,
@@ -88,23 +86,23 @@ def train_state(settings: StateTrainSettings) -> StateReport:
         settings = _with_base(base, config, settings)
         config = base.configured(config, keeps_tasks=settings.learn == "success")
     parts = settings.output.with_suffix(".parts")
-    parts.mkdir(parents=True, exist_ok=True)
     hashed = data_hash((e.content_sha256 for e in training), image_px=_unusual_px(settings))
     # Before training, so that invalid episodes are found at once.
     heldout_table, labelled = (
         scene_table(heldout, config),
         state_data.labelled_episodes(training, settings),
     )
+    check_long_enough(heldout_table)
     share = settings.share_of_human
     table = scene_table(training, config, labelled=labelled, human_share=share)
     if settings.learn == "all":
-        state_data.check_drawable(state_data.drawn_episodes(data))
+        state_data.check_drawable(state_data.drawn_episodes(data, settings))
     codec = _codec(table, config, base)
-    is_known = all(bool(table.knows_all(step).all()) for step in core_training.start_steps(table))
+    is_known = all(bool(table.knows_all(step).all()) for step in member_training.start_steps(table))
     reads_starts = settings.labelled_share < 1 or not is_known or bool(table.touched.any())
     table_file = parts / "table.safetensors"
     codec_tensors = {f"codec/{name}": value for name, value in codec.state_dict().items()}
-    save_file({**table.tensors(), **codec_tensors}, table_file)
+    write_tensors(table_file, {**table.tensors(), **codec_tensors}, {})
     # Of robots, if there are any.
     own = table.length[~table.human | table.human.all()]
     horizon_latents = (int(own.max()) - 1) // STEPS_PER_LATENT
@@ -112,20 +110,13 @@ def train_state(settings: StateTrainSettings) -> StateReport:
     work = _Work(settings, config, parts, hashed, reads_starts)
     _train_parts(work)
     dynamics, renderer, cpu_s = _assembled(work, codec)
-    measured = evaluate_dynamics(dynamics, heldout_table)
-    bounds = StateBounds(
-        disagreement_m=measured.disagreement_m,
-        distance=measured.distance,
-        horizon_latents=horizon_latents,
-        of_chunks=True,
-    )
-    metadata = _metadata(work, data, bounds, measured.figures, command=command, cpu_s=cpu_s)
+    metrics, bounds = evaluate_dynamics(dynamics, heldout_table)
+    bounds = bounds.model_copy(update={"horizon_latents": horizon_latents})
+    metadata = _metadata(work, data, bounds, metrics, command=command, cpu_s=cpu_s)
     digest = write_state_checkpoint(settings.output, dynamics, renderer, metadata)
     table_file.unlink()
     size = sum(p.numel() for p in (*dynamics.parameters(), *renderer.parameters()))
-    return StateReport(
-        settings.output, digest, size, cpu_s, len(training), len(heldout), measured.figures
-    )
+    return StateReport(settings.output, digest, size, cpu_s, len(training), len(heldout), metrics)
 
 
 def _metadata(
@@ -148,6 +139,7 @@ def _metadata(
         num_members=settings.num_members,
         renderer=settings.renderer,
         **_objects(data, work.config, base),
+        model_rate_hz=data.training[0].about.model_rate_hz,
         bounds=base.checkpoint.metadata.bounds if base and keeps_bounds else bounds,
         command=command,
         seed=settings.seed,
@@ -306,23 +298,16 @@ def _train_parts(work: _Work) -> None:
 def _train_renderer(work: _Work) -> None:
     torch.set_num_threads(1)
     settings = work.settings
-    episodes = state_data.drawn_episodes(state_data.load_state_data(settings))
+    known = state_data.drawn_episodes(state_data.load_state_data(settings), settings)
     rng = np.random.default_rng(settings.seed)
-    labelled = zip(episodes, state_data.labelled_episodes(episodes, settings), strict=True)
-    known = [episode for episode, is_labelled in labelled if is_labelled]
     chosen = rng.permutation(len(known))[:MAX_CLIPS]
     clips = scene_clips([known[index] for index in sorted(chosen)])
-    lines = ProgressLines("train renderer", has_bar=False)
-
-    def on_progress(share: float, step: int, loss: float) -> None:
-        lines.show(f"{share:.0%}  step {step}  loss {loss:.4f}")
-
     network, cpu_s = train_renderer(
         clips,
         settings.renderer,
         settings.drawing,
         rng=rng,
-        on_progress=on_progress,
+        title="train renderer",
         initial=None if work.base is None else work.base.checkpoint.renderer,
     )
     _keep(network, work.renderer_file, cpu_s)
@@ -355,12 +340,12 @@ def _train_reader(work: _Work, member: int) -> None:
     table, _ = _table(work)
     started_s, base = time.process_time(), work.base
     seed = work.settings.seed * _SEED_STRIDE + member
-    trained = train_reader(
+    trained = member_training.train_reader(
         table,
         work.config,
         work.settings.reader,
         seed=seed,
-        on_step=_on_step(member, "reader"),
+        title=f"train member {member} reader",
         initial=None if base is None else base.reader(work.config, member, seed=seed),
     )
     _keep(trained, work.reader_file(member), time.process_time() - started_s)
@@ -383,30 +368,21 @@ def _train_core(work: _Work, member: int) -> None:
             _load(reader, work.reader_file(member))
         reader.eval()
         readings = {
-            step: read_step(reader, table, step) for step in core_training.start_steps(table)
+            step: member_training.read_step(reader, table, step)
+            for step in member_training.start_steps(table)
         }
-    data = core_training.CoreData(
-        table, core_training.touch_latents(codec, table), readings, work.keeps_readers
+    data = member_training.CoreData(
+        table, member_training.touch_latents(codec, table), readings, work.keeps_readers
     )
-    on_step = _on_step(member, "core")
-    seed = work.settings.seed * _SEED_STRIDE + member
+    seed, title = work.settings.seed * _SEED_STRIDE + member, f"train member {member} core"
     initial = None
     if work.base is not None:
         learns_all = work.settings.learn == "all"
         initial = work.base.core(work.config, member, seed=seed, learns_all=learns_all)
-    core = core_training.train_core(
-        data, work.config, work.settings.core, seed=seed, on_step=on_step, initial=initial
+    core = member_training.train_core(
+        data, work.config, work.settings.core, seed=seed, title=title, initial=initial
     )
     _keep(core, work.core_file(member), time.process_time() - started_s)
-
-
-def _on_step(member: int, part: str) -> OnStep:
-    lines = ProgressLines(f"train member {member} {part}", has_bar=False)
-
-    def on_step(step: int, loss: float) -> None:
-        lines.show(f"step {step}  loss {loss:.4f}")
-
-    return on_step
 
 
 def _assembled(work: _Work, codec: TouchCodec) -> tuple[DynamicsModel, RendererNetwork, float]:

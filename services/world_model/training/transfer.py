@@ -40,7 +40,7 @@ class Base:
         if own.image_px != config.image_px:
             raise InvalidInputError(
                 f"--init {self._path.name}: reads images of {own.image_px} px, the episodes have "
-                f"{config.image_px} px; record them with its size"
+                f"{config.image_px} px; give --image-px {own.image_px}, and images no smaller"
             )
         if keeps_tasks:
             return own

@@ -100,14 +100,7 @@ def decode_png(data: bytes, shape: tuple[int, ...], dtype: str) -> np.ndarray:
     frame = frames[0]
     if frame.is_corrupt:
         raise CorruptDataError("PNG image is damaged")
-    if frame.format.name != form:
-        frame = frame.reformat(format=form)
-    plane = frame.planes[0]
-    rows = np.frombuffer(memoryview(plane), dtype=np.uint8).reshape(-1, plane.line_size)
-    wire = np.dtype(">u2") if form == "gray16be" else np.dtype(np.uint8)
-    row_bytes = shape[1] * wire.itemsize * (3 if form == "rgb24" else 1)
-    pixels = np.ascontiguousarray(rows[: shape[0], :row_bytes]).view(wire)
-    return pixels.astype(dtype).reshape(shape)
+    return frame.to_ndarray(format=form).astype(dtype, copy=False)
 
 
 def raw_form(
@@ -198,11 +191,9 @@ class VideoDecoder:
 
     def to_rgb(self, frame: VideoFrame) -> np.ndarray:
         """Pixels of a decoded image, uint8 [h, w, 3]."""
-        frame = self._reformatter.reformat(frame, format="rgb24", interpolation="BICUBIC")
-        plane = frame.planes[0]
-        rows = np.frombuffer(memoryview(plane), dtype=np.uint8).reshape(-1, plane.line_size)
-        pixels = rows[: frame.height, : 3 * frame.width]
-        return np.ascontiguousarray(pixels).reshape(frame.height, frame.width, 3)
+        return self._reformatter.reformat(
+            frame, format="rgb24", interpolation="BICUBIC"
+        ).to_ndarray()
 
 
 def check_order(codec: str, packets: Sequence[bytes]) -> bool:

@@ -24,6 +24,7 @@ from dextouch.bridges.import_images import (
     decode_raw,
     raw_form,
 )
+from dextouch.bridges.import_recording import whole_text
 from dextouch.errors import CorruptDataError, InvalidInputError, LimitExceededError
 from dextouch.geometry import DISTORTION_MODEL, NUM_DISTORTION
 from dextouch.streams import JPEG_UNIT, NO_DEVICE_TIME, StreamKind
@@ -196,12 +197,7 @@ def _from_corner(K: np.ndarray) -> tuple[float, ...]:
 
 
 def _text(value: object) -> str:
-    return _encodable(value[:128]) if isinstance(value, str) else ""
-
-
-def _encodable(text: str) -> str:
-    """Text without the halves of surrogate pairs that JSON allows and UTF-8 does not."""
-    return text.encode(errors="replace").decode()
+    return whole_text(value[:128]) if isinstance(value, str) else ""
 
 
 def _bytes(value: object) -> bytes:
@@ -523,7 +519,7 @@ def _flat(message: Plain, *, is_typed: bool) -> Item:
 def _names(paths: tuple[tuple[str, int], ...]) -> tuple[str, ...]:
     """Names of numbers (count −1) and of the elements of lists."""
     return tuple(
-        _encodable(name[-128:])
+        whole_text(name[-128:])
         for path, count in paths
         for name in ([path] if count < 0 else [f"{path}[{index}]" for index in range(count)])
     )

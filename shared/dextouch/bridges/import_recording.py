@@ -144,6 +144,11 @@ def printable(line: str) -> str:
     return "".join(one if one.isprintable() else "\ufffd" for one in line)
 
 
+def whole_text(value: object) -> str:
+    """Text of a value without half surrogates, which JSON can hold and UTF-8 cannot."""
+    return str(value).encode(errors="replace").decode()
+
+
 @dataclass(frozen=True)
 class ImportChoices:
     """What is chosen for an import of any format.
@@ -295,7 +300,7 @@ def new_attributes(
 
     Raises InvalidInputError for a task, domain or id that no recording may have.
     """
-    name = path.resolve().name.encode(errors="replace").decode()[-255:]
+    name = whole_text(path.resolve().name)[-255:]
     source = ImportedFile(
         name=name or "unnamed",
         sha256=sha256 or file_sha256(path),

@@ -37,7 +37,7 @@ from dextouch.errors import (
     LimitExceededError,
     NotFoundError,
 )
-from dextouch.geometry import pose_from_transform
+from dextouch.geometry import pose_from_transform, rigid_error
 from dextouch.streams import NO_DEVICE_TIME
 
 # Timelines that Rerun adds to every call, used only where a file has no other with times.
@@ -58,6 +58,8 @@ _ENCODINGS: Final = {
 # rerun.components.VideoCodec are the four-character codes of MP4.
 _VIDEO_CODECS = {0x61766331: "h264", 0x68657631: "h265", 0x76703039: "vp9", 0x61763031: "av1"}
 _CHILD_FROM_PARENT: Final = 2
+# How far R Rᵀ of a matrix may be from the identity (chosen: as of trackers' matrices).
+RIGID_TOLERANCE: Final = 1e-3
 _ROW_ID: Final = "rerun.controls.RowId"
 # Values that are remembered of entities whose rows leave some out.
 MAX_LATEST: Final = 4_000_000
@@ -405,6 +407,8 @@ def _transform(row: Row, known: Known, frame: str | None) -> Iterator[Item]:
     elif matrix is not None:
         T = np.eye(4)
         T[:3, :3] = matrix.reshape(3, 3).T
+        if rigid_error(T) > RIGID_TOLERANCE:
+            raise InvalidInputError("transform with a matrix that scales, shears or mirrors")
         pose = pose_from_transform(T)
     if t is not None:
         pose[:3] = t

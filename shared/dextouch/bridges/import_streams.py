@@ -33,6 +33,7 @@ from dextouch.errors import (
     UnknownNameError,
 )
 from dextouch.geometry import NUM_DISTORTION
+from dextouch.hands.robot_hand import RobotHand
 from dextouch.schemas import first_problems
 from dextouch.streams import (
     H264_UNIT,
@@ -93,6 +94,7 @@ def mapped_form(
     side = next((one for one in _SIDES if one in name.split("_")), None)
     numbers = form.kind != "image"
     size = math.prod(form.shape)
+    columns: list[int] = []
     if name.startswith("tactile_") and side:
         is_float = form.dtype.startswith("float") or size == layout.num_taxels
         count = layout.num_taxels if is_float else layout.num_raw_cells
@@ -115,7 +117,12 @@ def mapped_form(
         wanted, fits, made = "poses of one body", form.kind == "pose" and form.shape == (7,), form
     elif name in {"joints_measured", "joints_commanded"}:
         wanted, fits = "numbers", numbers
-        made = replace(form, kind="robot_state", unit="rad", dtype="float64", shape=(size,))
+        columns = _hand_columns(form)
+        names = tuple(form.names[column] for column in columns) or form.names
+        size = len(columns) or size
+        made = replace(
+            form, kind="robot_state", unit="rad", dtype="float64", shape=(size,), names=names
+        )
     elif name.startswith("camera_"):
         wanted, fits, made = "images", not numbers, form
     else:
@@ -124,16 +131,27 @@ def mapped_form(
         raise InvalidInputError(f"stream {name!r}: got {form.describe()}, expected {wanted}")
     if made == form:
         return form, np.asarray, side
-    names = form.names if made.kind == "robot_state" else ()
+    names = made.names if made.kind == "robot_state" else ()
     made = replace(made, names=names, is_padded=False, as_numbers="")
     dtype = np.dtype(made.dtype).newbyteorder("<")
 
     def convert(values: np.ndarray) -> np.ndarray:
         if made.kind == "keypoints" and values.ndim == 2:
             values = values[:, :3]
+        values = values[columns] if columns else values
         return np.ascontiguousarray(values, dtype=dtype).reshape(made.shape)
 
     return made, convert, side
+
+
+def _hand_columns(form: Form) -> list[int]:
+    """Where a vector has the joints of both our hands, in the order of `RobotHand`, left first.
+
+    Nothing where it lacks one, as those of other hands.
+    """
+    names = [name for side in _SIDES for name in RobotHand(side).joint_names]
+    is_ours = len(form.shape) == 1 and set(names) <= set(form.names)
+    return [form.names.index(name) for name in names] if is_ours else []
 
 
 class _Part:

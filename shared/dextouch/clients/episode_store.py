@@ -11,29 +11,10 @@ import httpx
 import numpy as np
 from pydantic import BaseModel, ValidationError
 
+from dextouch import schemas
 from dextouch.clients.http_link import service_address
 from dextouch.episodes import StreamData, Window, decode_window
 from dextouch.errors import DexTouchError, UnavailableError
-from dextouch.schemas import (
-    ActionKind,
-    BatchReceipt,
-    CatalogHours,
-    CheckedTakes,
-    CheckTakes,
-    ConfirmRemoval,
-    DeletionsRevision,
-    EpisodeDetail,
-    EpisodeList,
-    FinishRecording,
-    LedgerEntry,
-    Problem,
-    RecordingAttributes,
-    RecordingList,
-    RecordingStatus,
-    StreamContent,
-    UploadList,
-    error_from_problem,
-)
 from dextouch.streams import SampleBatch, StreamDescriptor, encode_batch, unpack
 
 M = TypeVar("M", bound=BaseModel)
@@ -81,15 +62,15 @@ class EpisodeStoreClient:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def create(self, attributes: RecordingAttributes) -> RecordingStatus:
+    def create(self, attributes: schemas.RecordingAttributes) -> schemas.RecordingStatus:
         """Begin an upload, or query the state of one that exists."""
         return self._model(
-            RecordingStatus, "POST", "/v1/recordings", content=attributes.model_dump_json()
+            schemas.RecordingStatus, "POST", "/v1/recordings", content=attributes.model_dump_json()
         )
 
-    def status(self, recording_id: str) -> RecordingStatus:
+    def status(self, recording_id: str) -> schemas.RecordingStatus:
         """The batch that each stream of an upload expects next."""
-        return self._model(RecordingStatus, "GET", f"/v1/recordings/{_part(recording_id)}")
+        return self._model(schemas.RecordingStatus, "GET", f"/v1/recordings/{_part(recording_id)}")
 
     def send_batch(
         self,
@@ -98,7 +79,7 @@ class EpisodeStoreClient:
         batch: SampleBatch | bytes,
         *,
         number: int,
-    ) -> BatchReceipt:
+    ) -> schemas.BatchReceipt:
         """Send batch `number` of a stream; the store keeps it when this returns.
 
         Bytes are those of `dextouch.streams.frame_body` or `encode_batch`, sent as they are.
@@ -109,7 +90,7 @@ class EpisodeStoreClient:
         )
         if isinstance(batch, SampleBatch):
             batch = encode_batch(descriptor, batch, number=number)
-        return self._model(BatchReceipt, "POST", path, content=batch)
+        return self._model(schemas.BatchReceipt, "POST", path, content=batch)
 
     def finish(
         self,
@@ -117,52 +98,52 @@ class EpisodeStoreClient:
         num_batches: Mapping[str, int],
         *,
         success: bool | None = None,
-        ledger: tuple[LedgerEntry, ...] = (),
-        content: Mapping[str, StreamContent] | None = None,
-    ) -> RecordingStatus:
+        ledger: tuple[schemas.LedgerEntry, ...] = (),
+        content: Mapping[str, schemas.StreamContent] | None = None,
+    ) -> schemas.RecordingStatus:
         """Finish an upload with its number of batches per stream; the recording becomes visible.
 
         With `content` (`dextouch.episodes.ContentDigest`) the store compares all samples, and the
         status has what it committed.
         """
-        body = FinishRecording(
+        body = schemas.FinishRecording(
             num_batches=dict(num_batches),
             content=dict(content or {}),
             success=success,
             ledger=ledger,
         )
         path = f"/v1/recordings/{_part(recording_id)}/finish"
-        return self._model(RecordingStatus, "POST", path, content=body.model_dump_json())
+        return self._model(schemas.RecordingStatus, "POST", path, content=body.model_dump_json())
 
     def deletions_revision(self) -> str:
         """A text that changes with every permanent deletion."""
         path = "/v1/deletions/revision"
-        return self._model(DeletionsRevision, "GET", path).revision
+        return self._model(schemas.DeletionsRevision, "GET", path).revision
 
-    def check_takes(self, spooled: CheckTakes) -> CheckedTakes:
+    def check_takes(self, spooled: schemas.CheckTakes) -> schemas.CheckedTakes:
         """Which takes of a station's spool were deleted permanently."""
         path, body = "/v1/deletions/check", spooled.model_dump_json()
-        return self._model(CheckedTakes, "POST", path, content=body)
+        return self._model(schemas.CheckedTakes, "POST", path, content=body)
 
-    def confirm_removal(self, removed: ConfirmRemoval) -> None:
+    def confirm_removal(self, removed: schemas.ConfirmRemoval) -> None:
         """Say that a station holds no deleted takes any more, except those that it names.
 
         Raises ConflictError if there was another deletion since `removed.revision`.
         """
         path, body = "/v1/deletions/confirm", removed.model_dump_json()
-        self._model(DeletionsRevision, "POST", path, content=body)
+        self._model(schemas.DeletionsRevision, "POST", path, content=body)
 
-    def recordings(self, **filters: Scalar | Sequence[str] | None) -> RecordingList:
+    def recordings(self, **filters: Scalar | Sequence[str] | None) -> schemas.RecordingList:
         """Finished recordings that match every given filter, as in docs/wire_format.md.
 
         Such as `station="bench"`, `min_quality=["coverage:0.95"]`, `after="take-7"`.
         """
-        return self._model(RecordingList, "GET", "/v1/recordings", query=filters)
+        return self._model(schemas.RecordingList, "GET", "/v1/recordings", query=filters)
 
-    def recording_attributes(self, recording_id: str) -> RecordingAttributes:
+    def recording_attributes(self, recording_id: str) -> schemas.RecordingAttributes:
         """Attributes of a finished recording."""
         path = f"/v1/recordings/{_part(recording_id)}/attributes"
-        return self._model(RecordingAttributes, "GET", path)
+        return self._model(schemas.RecordingAttributes, "GET", path)
 
     def recording_samples(
         self,
@@ -179,29 +160,29 @@ class EpisodeStoreClient:
             arrays["t_host_ns"], arrays["t_device_ns"], arrays["sequence"], arrays["values"]
         )
 
-    def episodes(self, **filters: Scalar | Sequence[str] | None) -> EpisodeList:
+    def episodes(self, **filters: Scalar | Sequence[str] | None) -> schemas.EpisodeList:
         """One page of the episodes that match every given filter, named as in `recordings`."""
-        return self._model(EpisodeList, "GET", "/v1/episodes", query=filters)
+        return self._model(schemas.EpisodeList, "GET", "/v1/episodes", query=filters)
 
-    def hours(self, **filters: Scalar | Sequence[str] | None) -> CatalogHours:
+    def hours(self, **filters: Scalar | Sequence[str] | None) -> schemas.CatalogHours:
         """Hours of the episodes that match, by task, domain and origin."""
-        return self._model(CatalogHours, "GET", "/v1/catalog/hours", query=filters)
+        return self._model(schemas.CatalogHours, "GET", "/v1/catalog/hours", query=filters)
 
-    def uploads(self, *, idle_s: float = 0.0) -> UploadList:
+    def uploads(self, *, idle_s: float = 0.0) -> schemas.UploadList:
         """Unfinished uploads that have been idle for at least `idle_s`."""
-        return self._model(UploadList, "GET", "/v1/uploads", query={"idle_s": idle_s})
+        return self._model(schemas.UploadList, "GET", "/v1/uploads", query={"idle_s": idle_s})
 
-    def expire_uploads(self, *, idle_s: float) -> UploadList:
+    def expire_uploads(self, *, idle_s: float) -> schemas.UploadList:
         """Drop unfinished uploads that have been idle for at least `idle_s` and return them.
 
         The store refuses less than ten minutes.
         """
         body = json.dumps({"idle_s": idle_s})
-        return self._model(UploadList, "POST", "/v1/uploads/expire", content=body)
+        return self._model(schemas.UploadList, "POST", "/v1/uploads/expire", content=body)
 
-    def episode(self, episode_id: str) -> EpisodeDetail:
+    def episode(self, episode_id: str) -> schemas.EpisodeDetail:
         """Attributes of an episode."""
-        return self._model(EpisodeDetail, "GET", f"/v1/episodes/{_part(episode_id)}")
+        return self._model(schemas.EpisodeDetail, "GET", f"/v1/episodes/{_part(episode_id)}")
 
     def episode_samples(
         self,
@@ -223,7 +204,7 @@ class EpisodeStoreClient:
         num_steps: int = 17,
         *,
         cameras: tuple[str, ...] = ("camera_head",),
-        action_kind: ActionKind = "measured",
+        action_kind: schemas.ActionKind = "measured",
         half_size: bool = False,
     ) -> Window:
         """A window on the model grid, as `EpisodeReader.window` gives it."""
@@ -283,7 +264,7 @@ class EpisodeStoreClient:
             )
         except httpx.TransportError as error:
             raise UnavailableError(
-                f"episode store at {self._http.base_url}: {method} {path} got no answer "
+                f"episode store at {_shown(self._http.base_url)}: {method} {path} got no answer "
                 f"({type(error).__name__}: {error}); check the address or try again later"
             ) from error
         if response.is_success:
@@ -291,9 +272,17 @@ class EpisodeStoreClient:
         raise _refusal(response)
 
 
+def _shown(url: httpx.URL) -> httpx.URL:
+    """An address without the name and password that it may hold, and without its query."""
+    return url.copy_with(query=None, username=None, password=None)
+
+
 def _refusal(response: httpx.Response) -> DexTouchError:
     try:
-        return error_from_problem(Problem.model_validate_json(response.content))
+        where = f"{response.request.method} {_shown(response.request.url)}"
+        return schemas.error_from_problem(
+            schemas.Problem.model_validate_json(response.content), where
+        )
     except ValidationError:
         # A proxy in between may send Retry-After, too.
         seconds = response.headers.get("retry-after", "")

@@ -169,4 +169,4 @@ def _checked(reply: Reply, where: str) -> Reply:
             f"{where}: got status {reply.status} without a problem+json body; "
             "is a DexTouch service listening there?"
         ) from error
-    raise error_from_problem(problem)
+    raise error_from_problem(problem, where)

@@ -249,6 +249,15 @@ class OpenedGroup:
                 f"{self.what}: was {change} while it was read; list the store again"
             ) from error
 
+    @contextmanager
+    def present(self) -> Iterator[None]:
+        """`check_present` where reading its files fails."""
+        try:
+            yield
+        except StorageError as error:
+            self.check_present(error)
+            raise
+
 
 # Evicted mappings are dropped, not closed: readers may still use them, and the last one frees them.
 # A file that was replaced under the same name has another identity.

@@ -148,11 +148,8 @@ def read_group(files: GroupFiles, model: type[A]) -> GroupContents[A]:
     if commit is None:
         raise CorruptDataError(f"{what}: {COMMIT_FILE} is missing")
     opened = OpenedGroup(files, sha256_hex(commit), what)
-    try:
+    with opened.present():
         return _read_group(opened, commit, kind, model)
-    except StorageError as error:
-        opened.check_present(error)
-        raise
 
 
 def _read_group(opened: OpenedGroup, commit: bytes, kind: Kind, model: type[A]) -> GroupContents[A]:

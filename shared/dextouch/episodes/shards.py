@@ -11,7 +11,8 @@ import hashlib
 import math
 import os
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ from jaxtyping import Shaped
 
 from dextouch.episodes.files import ByteSource, OpenedGroup, disk_errors, write_parts
 from dextouch.episodes.format import ZSTD_LEVEL, ArrayEntry, shard_path, with_rows
-from dextouch.errors import CorruptDataError, InvalidInputError, StorageError
+from dextouch.errors import CorruptDataError, InvalidInputError
 
 CRC_BYTES = 4
 INDEX_ENTRY_BYTES = 16
@@ -130,7 +131,9 @@ class ShardReader:
         self.num_rows, self.chunk_rows = entry.shape[0], entry.chunk_rows
         self.num_chunks = -(-entry.shape[0] // entry.chunk_rows)
         self._index = index
-        self._group = group
+        self._present: Callable[[], AbstractContextManager[None]] = (
+            nullcontext if group is None else group.present
+        )
         self._crcs = _committed_crcs(entry, self.num_chunks, what)
 
     def read(self, start: int = 0, stop: int | None = None) -> Shaped[np.ndarray, "n ..."]:
@@ -139,11 +142,8 @@ class ShardReader:
         Raises InvalidInputError for rows outside the array, CorruptDataError for missing bytes or a
         checksum mismatch, NotFoundError if the group was deleted or replaced since it was opened.
         """
-        try:
+        with self._present():
             return self._read(start, stop)
-        except StorageError as error:
-            self._check_present(error)
-            raise
 
     def _read(self, start: int, stop: int | None) -> Shaped[np.ndarray, "n ..."]:
         num_rows, rows_each = self.num_rows, self.chunk_rows
@@ -177,13 +177,10 @@ class ShardReader:
     def payload(self, number: int) -> bytes:
         """The encoded bytes of one storage chunk, verified, without checksum; raises as `read`."""
         what = f"{self._what}: storage chunk {number}"
-        try:
+        with self._present():
             offset, length = self._checked_index()[number].tolist()
             data = self._source.read(offset, length)
             return _without_crc(data, 0, length, what, self._crc(number))
-        except StorageError as error:
-            self._check_present(error)
-            raise
 
     def read_bytes(self, start: int, stop: int) -> bytes:
         """Bytes start … stop−1 of a `bytes` array, which the caller verifies.
@@ -194,7 +191,7 @@ class ShardReader:
         rows, step = self.chunk_rows, self.chunk_rows + CRC_BYTES
         first, last = start // rows, (stop - 1) // rows
         begin, end = start + first * CRC_BYTES, stop + last * CRC_BYTES
-        try:
+        with self._present():
             self._checked_index()
             data = self._source.read(begin, end - begin)
             if len(data) != end - begin:
@@ -202,9 +199,6 @@ class ShardReader:
                     f"{self._what}: bytes {start} … {stop - 1} lie outside the file; the file is "
                     "truncated, restore it from a copy"
                 )
-        except StorageError as error:
-            self._check_present(error)
-            raise
         head = (first + 1) * rows - start
         if first == last:
             return bytes(data)
@@ -238,15 +232,8 @@ class ShardReader:
 
         They must be contiguous up to the index, and long enough for the rows in the commit record.
         """
-        try:
+        with self._present():
             return self._checked_index()
-        except StorageError as error:
-            self._check_present(error)
-            raise
-
-    def _check_present(self, error: StorageError) -> None:
-        if self._group is not None:
-            self._group.check_present(error)
 
     def _checked_index(self) -> np.ndarray:
         if self._index is None:

@@ -98,6 +98,12 @@ class EpisodeStore:
         """The folder that other machines must see to use this store; none for a bucket."""
         return (self.root,) if isinstance(self._storage, _LocalStorage) else ()
 
+    def require_folder(self) -> "EpisodeStore":
+        """The store itself; raises NotFoundError without its folder, as where none is mounted."""
+        if self.folders and not self.root.is_dir():
+            raise NotFoundError(f"store {self.root}: no such folder; mount it, or name another one")
+        return self
+
     def writer(
         self, *, kind: Kind = "episode", attributes: Attributes, replaces: bool = False
     ) -> EpisodeWriter:

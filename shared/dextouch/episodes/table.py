@@ -160,7 +160,7 @@ class _Chosen:
             raise ConflictError(
                 f"episodes {first.episode_id!r} and {name!r}: have model rates of "
                 f"{first.model_rate_hz:g} and {about.model_rate_hz:g} Hz, expected one; align them "
-                "with the same `--model-rate`"
+                "at one rate (`dextouch align serve --options.model-rate-hz`)"
             )
         self.names.add(name)
         self._first = first

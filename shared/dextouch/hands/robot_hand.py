@@ -122,6 +122,7 @@ class HandModel:
         fingers: the tables, which do not change: others are another hand.
         joint_names: in the order of the joint vector: finger by finger, from the wrist out.
         lower_rad, upper_rad: joint limits [joints].
+        finger_of_joint: index of each joint's finger [joints].
 
     Raises:
         UnknownNameError: a side other than "left" and "right", or an unknown chain.
@@ -142,6 +143,7 @@ class HandModel:
         self.joint_names = tuple(row.name for row in rows)
         self.lower_rad, self.upper_rad = np.array([row.limits_rad for row in rows]).T.copy()
         self._chains = _Chains.of(fingers)
+        self.finger_of_joint = np.nonzero(self._chains.is_joint)[0]
 
     def joint_frames(
         self, joints_rad: np.ndarray

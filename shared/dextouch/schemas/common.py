@@ -132,7 +132,7 @@ def problem_from_error(error: errors.DexTouchError, *, instance: str, request_id
     )
 
 
-def error_from_problem(problem: Problem) -> errors.DexTouchError:
+def error_from_problem(problem: Problem, where: str | None = None) -> errors.DexTouchError:
     """Convert a response body to an error: the named class if known, otherwise one by status."""
     name = problem.type.removeprefix(TYPE_PREFIX)
     named = getattr(errors, name, None)
@@ -143,7 +143,10 @@ def error_from_problem(problem: Problem) -> errors.DexTouchError:
     # UnknownNameError builds its own message; the server's is the one to keep.
     error = kind.__new__(kind)
     details = {key: value for key, value in problem.details.items() if key not in RESERVED}
-    errors.DexTouchError.__init__(error, problem.detail, **details)
+    # A service that refuses a key does not know its own address.
+    is_of_key = where is not None and issubclass(kind, errors.AccessDeniedError)
+    message = f"{where}: {problem.detail}" if is_of_key else problem.detail
+    errors.DexTouchError.__init__(error, message, **details)
     return error
 
 

@@ -150,11 +150,13 @@ def _health_router(
 ) -> APIRouter:
     router = APIRouter(tags=["health"])
 
+    @router.head("/healthz", include_in_schema=False)
     @router.get("/healthz")
     async def check_liveness() -> Health:
         """Liveness probe."""
         return Health(service=name, version=__version__)
 
+    @router.head("/readyz", include_in_schema=False)
     @router.get("/readyz", responses={503: {"model": Readiness}})
     async def check_readiness(request: Request, response: Response) -> Readiness:
         """Readiness probe."""

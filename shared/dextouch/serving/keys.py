@@ -20,7 +20,9 @@ MIN_BITS: Final = 40
 # Neighbours in these rows, in both directions, are orderly, as are those in the alphabet.
 KEYBOARD_ROWS: Final = ("1234567890", "qwertyuiop", "asdfghjkl", "zxcvbnm")
 # Keys that documentation of this or an earlier release showed.
-PUBLISHED: Final = frozenset({"16 characters or more", "the-key-of-the-store"})
+PUBLISHED: Final = frozenset(
+    {"16 characters or more", "the-key-of-the-store", "$(openssl rand -hex 32)"}
+)
 # Of a repetition; shorter ones also occur in random keys.
 REPEATED: Final = 3
 # A character is orderly if it follows the last one, or the last but one as in "a1b2c3d4".
@@ -109,7 +111,10 @@ def not_signed_in() -> AccessDeniedError:
 def no_key(authorization: str | None) -> AccessDeniedError:
     """Error for a request with an unknown key, or with none."""
     if presented_key(authorization) is not None:
-        return AccessDeniedError("unknown key", reason="unknown_key")
+        return AccessDeniedError(
+            "unknown key: expected one of this service's api_keys, or of an enrolled station",
+            reason="unknown_key",
+        )
     return AccessDeniedError(
         "no key: expected the header 'Authorization: Bearer KEY'", reason="missing_key"
     )

@@ -64,6 +64,7 @@ from .samples import encoded_values as encoded_values
 from .samples import residual_limits_s as residual_limits_s
 from .taxel_blocks import drifting_taxels as drifting_taxels
 from .taxel_blocks import implausible_gain as implausible_gain
+from .taxel_faults import MAX_MISSING as MAX_MISSING
 from .taxel_faults import MIN_SAMPLES_TO_JUDGE as MIN_SAMPLES_TO_JUDGE
 from .taxel_faults import TaxelFaults as TaxelFaults
 from .taxel_faults import neighbour_share as neighbour_share

@@ -42,6 +42,7 @@ HELLO = {
     "frame": {"handedness": "right", "axes": ["+x", "+z", "-y"]},
     "length_unit": "m",
 }
+FINGERS = {"kind": "finger_tracker", "nodes": [["wrist", "wrist"]]}
 
 
 def line(**changes):
@@ -105,13 +106,14 @@ def test_no_first_line_breaks_it(data):
     [
         ({"protocol": "another"}, "protocol"),
         ({"version": 2}, "version 2, expected 1"),
-        ({"kind": "finger_tracker", "nodes": [["wrist", "wrist"]]}, "is a finger_tracker"),
+        ({**FINGERS, "devices": HELLO["devices"][:2]}, "is a finger_tracker"),
+        (FINGERS, r"source \['left', 'right', 'right'\] are not all different"),
         ({"kind": "camera"}, "kind"),
         ({"length_unit": "inch"}, "length_unit"),
         ({"devices": []}, "devices"),
         ({"devices": [HELLO["devices"][0]] * 2}, "not all different"),
         ({"nodes": [["wrist", "wrist"]]}, "nodes"),
-        ({"kind": "finger_tracker"}, "nodes"),
+        ({"kind": "finger_tracker", "devices": HELLO["devices"][:2]}, "nodes"),
         ({"extra": 1}, "extra"),
         ({"frame": {"handedness": "left", "axes": ["+x", "+z", "-y"]}}, "right-handed"),
         ({"frame": {"handedness": "right", "axes": ["+x", "+x", "-y"]}}, "each of x, y and z"),

@@ -165,6 +165,11 @@ def test_a_tracker_elsewhere_says_that_it_sits_on_no_wrist():
         pose_from("left")
 
 
+def test_a_port_that_cannot_be_opened_names_what_tells_why():
+    with pytest.raises(DeviceError, match=r"/dev/none: cannot be opened .*; .*`dextouch doctor`"):
+        SerialTransport(lambda: "/dev/none").open()
+
+
 def test_a_host_that_has_no_name_is_absent():
     with pytest.raises(DeviceError, match=r"socket glove\.\.lab:1: cannot be opened"):
         tcp_transport("glove..lab", 1).open()

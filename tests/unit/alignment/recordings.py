@@ -23,6 +23,7 @@ def write_recording(
     task="stand-bottle",
     trace_id=None,
     camera=None,
+    num_joints=40,
 ):
     """A robot that stands still; `lost` are (stream, first, last) samples that never arrived.
 
@@ -44,7 +45,7 @@ def write_recording(
     t_ns = np.arange(round(seconds * 100), dtype=np.int64) * 10_000_000
     with store.writer(kind="recording", attributes=attributes) as writer:
         for name in streams:
-            row = np.full(40, 0.25) if name.startswith("joints") else POSE
+            row = np.full(num_joints, 0.25) if name.startswith("joints") else POSE
             stream = StreamDescriptor(
                 name=name,
                 kind="pose" if len(row) == 7 else "robot_state",

@@ -99,7 +99,15 @@ def test_report_of_a_recording_or_its_episode(store, tmp_path, capsys, which):
 
 def test_report_of_what_is_not_aligned(store, capsys):
     assert main(["align", "report", "other", "--store", str(store.root)]) == 3
-    assert "other" in capsys.readouterr().err
+    assert "`dextouch align run other`" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("arguments", [["run", "--all"], ["run", "take"], ["report", "take"]])
+def test_a_store_that_is_not_there_is_not_a_store_where_all_is_done(tmp_path, capsys, arguments):
+    missing = tmp_path / "missing"
+    assert main(["align", *arguments, "--store", str(missing)]) == 3
+    assert f"store {missing}: no such folder" in capsys.readouterr().err
+    assert not missing.exists()
 
 
 @pytest.mark.parametrize(

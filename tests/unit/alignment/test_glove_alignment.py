@@ -188,6 +188,20 @@ def test_samples_with_a_missing_reading_are_left_out(tmp_path):
     assert report.quality["tactile_left_num_incomplete"] == 1
 
 
+def test_a_taxel_of_pressures_that_is_never_measured_costs_no_sample(tmp_path):
+    _, batch, _ = own_glove()
+    values = TRUE_KPA.copy()
+    values[:, 40] = np.nan
+    values[7, 41] = np.nan
+    broken = SampleBatch(batch.t_host_ns, batch.t_device_ns, batch.sequence, values)
+    report, episode = align(tmp_path, glove_descriptor((320,), "float32", "kPa"), broken, {})
+    assert report.refused_taxels == {"tactile_left": {"absent": (40,)}}
+    assert report.quality["tactile_left_num_incomplete"] == 1
+    pressures = episode.read("tactile_left").values
+    expected = np.delete(np.where(np.arange(320) == 40, 0, TRUE_KPA), 7, axis=0)
+    np.testing.assert_array_equal(pressures, expected)
+
+
 def test_another_makers_glove_without_a_map_is_refused(tmp_path):
     stream, batch, calibration = vendor_glove("wuji")
     del calibration["tactile_left_cells"]

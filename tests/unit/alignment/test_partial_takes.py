@@ -129,6 +129,13 @@ def test_a_take_without_any_hand_is_refused_by_what_it_lacks(tmp_path):
         aligned(tmp_path, streams=("head",))
 
 
+def test_joints_of_another_robot_are_refused_by_their_number(tmp_path):
+    store = EpisodeStore(tmp_path)
+    recordings.write_recording(store, "take", num_joints=41)
+    with pytest.raises(InvalidInputError, match=r"'joints_measured' .* \(41,\), expected the 40"):
+        align_recording(store, "take", AlignmentOptions())
+
+
 def test_a_camera_without_a_matrix(tmp_path):
     store, grid = aligned(tmp_path, K_head=False)
     assert grid.about.K_head is None

@@ -8,6 +8,7 @@ from dextouch.streams import StreamDescriptor
 from services.alignment.retargeting import RetargetStatus
 from services.alignment.synchronization.grid_actions import (
     GriddedStreams,
+    place_streams,
     retarget_hands,
     status_on_grid,
 )
@@ -135,3 +136,33 @@ def test_joints_beyond_the_last_sample_stay_in_their_limits(end):
         assert (found[:, side_index] <= upper_rad[side]).all()
         np.testing.assert_array_equal(found[row, side_index, 6::4], upper_rad[side][6::4])
         assert (found[1, side_index, 6::4] < 0.6).all()
+
+
+@pytest.mark.parametrize(("max_gap_ms", "is_bridged"), [(50, False), (333, True), (1000, True)])
+def test_forces_of_pads_are_known_across_the_gaps_that_are_bridged(max_gap_ms, is_bridged):
+    period_ns = 16_666_667
+    t_ns = period_ns * np.arange(120, dtype=np.int64)
+    # 317 ms between neighbours, and one pad whose gap is of a single sample.
+    t_ns = np.delete(t_ns, slice(50, 68))
+    forces_n = np.full((len(t_ns), 6), 5.0)
+    forces_n[20, 3] = np.nan
+    stream = LoadedStream(
+        StreamDescriptor(
+            name="tactile_left",
+            kind="tactile",
+            shape=(320,),
+            dtype="float32",
+            unit="kPa",
+            nominal_rate_hz=60.0,
+            side="left",
+        ),
+        t_ns,
+        forces_n,
+    )
+    grid_ns = np.arange(0, t_ns[-1], 66 * MS)
+    gridded = place_streams({"tactile_left": stream}, grid_ns, max_gap_ns=max_gap_ms * MS)
+    felt_n = gridded.pad_forces_n("left")
+    in_gap = (grid_ns > t_ns[49]) & (grid_ns < t_ns[50])
+    np.testing.assert_allclose(felt_n[~in_gap], 5.0)
+    np.testing.assert_allclose(felt_n[in_gap], 5.0 if is_bridged else 0.0)
+    np.testing.assert_array_equal(gridded.pad_forces_n("right"), 0.0)

@@ -18,6 +18,7 @@ from dextouch.bridges.import_streams import mapped_form
 from dextouch.bridges.mcap import export_mcap, records
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import CorruptDataError, InvalidInputError
+from dextouch.hands.robot_hand import RobotHand
 from tests.unit.bridges.foreign_files import (
     GOLDEN,
     PIXELS,
@@ -365,6 +366,20 @@ def test_whole_numbers_as_touch_are_what_their_count_says(count, unit, dtype, is
     form, convert, _ = mapped_form("tactile_left", item.form)
     assert (form.unit, form.dtype) == (unit, dtype)
     assert convert(item.decode()).tolist() == list(range(count))
+
+
+def test_joints_of_our_hands_have_our_order_whatever_that_of_the_message():
+    ours = [name for side in ("left", "right") for name in RobotHand(side).joint_names]
+    # As of a whole robot, whose publisher sorts the names.
+    names = sorted(["arm_1", "arm_2", *ours])
+    message = {"name": names, "position": [float(len(name)) for name in names]}
+    (item,) = items_of("sensor_msgs/JointState", message)
+    form, convert, _ = mapped_form("joints_measured", item.form)
+    assert form.names == tuple(ours)
+    assert convert(item.decode()).tolist() == [len(name) for name in ours]
+    (item,) = items_of("sensor_msgs/JointState", {"name": ["b", "a"], "position": [1.0, 2.0]})
+    form, convert, _ = mapped_form("joints_measured", item.form)
+    assert (form.names, convert(item.decode()).tolist()) == (("b", "a"), [1, 2])
 
 
 def test_rectified_images_have_the_matrix_of_their_projection(store, tmp_path):

@@ -46,6 +46,7 @@ def rrd(path, timelines=("camera",)):
         turned = rr.Quaternion(xyzw=[0, 0, 0.6, 0.8])
         stream.log("world/hand", rr.Transform3D(translation=[k, 2, 3], quaternion=turned))
         stream.log("world/turn", rr.Transform3D(translation=[k, 2, 3], mat3x3=TURN))
+        stream.log("world/mirror", rr.Transform3D(mat3x3=np.diag([1.0, 1, -1])))
         stream.log("world/points", rr.Points3D(np.full((2 + k % 2, 3), k)))
         stream.log("plots/force", rr.Scalars([k, 2.5]))
         stream.log("plots/cells", rr.AnyValues(kpa=np.arange(4.0) + k))
@@ -89,7 +90,7 @@ def test_what_rerun_wrote_arrives(store, tmp_path):
     K = recording.attributes.calibration["K_head"]
     assert K == ((5, 0, 3), (0, 5, 2), (0, 0, 1))
     assert recording.streams["wrist_left"].frame == "world"
-    assert [one.source for one in report.refused] == ["/text"]
+    assert [one.source for one in report.refused] == ["/world/mirror", "/text"]
     assert report.kept_as_numbers.keys() == {"world_points", "plots_cells"}
 
 

@@ -169,6 +169,8 @@ def test_latency_from_taps(tmp_path, stream):
     start_ns = min(t_glove_ns[0], t_tracker_ns[0])
     pressures = np.zeros((len(kpa), 320))
     pressures[:, 7] = kpa
+    # A taxel that is never measured.
+    pressures[:, 300] = np.nan
     poses = np.zeros((len(height_m), 7))
     poses[:, 2], poses[:, 3] = height_m, 1.0
     # Times that the tracker lost its target.

@@ -120,6 +120,41 @@ def test_every_command_refuses_an_unknown_section(write, capsys):
     assert "dextouch.toml:4: unknown section [dashbord]" in capsys.readouterr().err
 
 
+def test_variables_that_set_nothing_are_named_when_a_command_starts(monkeypatch, capsys):
+    for variable in (
+        "DEXTOUCH_EPISODE_STORE_PROT",
+        "DEXTOUCH_EPISODE_STORE_PORT",
+        "DEXTOUCH_EPISODE_STORE_UPLOAD_LIMITS__NO",
+        "DEXTOUCH_DASHBOARD_PROT",
+        "DEXTOUCH_DATA",
+    ):
+        monkeypatch.setenv(variable, "x")
+    assert main(["store", "serve"]) == 3
+    shown = capsys.readouterr().err.splitlines()
+    warnings = [line for line in shown if "warning" in line]
+    assert warnings == [
+        "dextouch store serve: warning: DEXTOUCH_EPISODE_STORE_PROT sets nothing: there is no such "
+        "setting; did you mean DEXTOUCH_EPISODE_STORE_PORT?",
+        "dextouch store serve: warning: DEXTOUCH_EPISODE_STORE_UPLOAD_LIMITS__NO sets nothing: "
+        "there is no such setting; see dextouch config show episode_store",
+    ]
+
+
+def test_a_section_is_not_taken_for_a_setting_of_one_whose_name_it_begins_with():
+    given = ["DEXTOUCH_WORLD_MODEL_TRAIN_SEED", "DEXTOUCH_WORLD_MODEL_NO", "dextouch_twin_port"]
+    (problem,) = configuration.unknown_variables("world_model", given)
+    assert problem.startswith("DEXTOUCH_WORLD_MODEL_NO sets nothing")
+    assert not configuration.unknown_variables("twin", given)
+
+
+def test_variables_of_the_chosen_form_are_looked_at_and_aliases_are_none(monkeypatch, capsys):
+    monkeypatch.setenv("DEXTOUCH_WORLD_MODEL_TRAIN_SEEED", "1")
+    assert main(["train", "world-model", "--preset", "tiny"]) == 3
+    assert "did you mean DEXTOUCH_WORLD_MODEL_TRAIN_SEED?" in capsys.readouterr().err
+    (problem,) = configuration.unknown_variables("up", ["DEXTOUCH_UP_JSON_PATH"])
+    assert problem.endswith("see dextouch config show up")
+
+
 @pytest.mark.long
 def test_show_says_where_each_setting_comes_from(write, monkeypatch, capsys):
     write(FILE)

@@ -27,7 +27,7 @@ def test_a_small_state_model_is_trained_before_its_endings_are_judged(tmp_path, 
         monkeypatch.setattr(
             place, name, lambda words, word=word: called.append([word, *words]) or 0
         )
-    monkeypatch.setattr(scoring, "_load", load)
+    monkeypatch.setattr(scoring.Models, "load", load)
     with pytest.raises(LoadedError) as caught:
         scoring.train_models(tmp_path)
     world_model, _, probe = caught.value.args

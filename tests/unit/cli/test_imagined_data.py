@@ -20,13 +20,20 @@ from services.pipelines.imagined_data import (
     chosen_episodes,
     imagined_main,
     judged_steps,
+    refuse_trained_episodes,
 )
 from services.pipelines.parsers import seed_range
 from services.pipelines.servers import served
 from services.twin.episodes import TakeOptions, record, write_episode
 from services.twin.settings import TwinSettings
 from services.twin.stage import Stage
-from services.world_model.checkpoints import write_state_checkpoint
+from services.world_model.checkpoints import (
+    CheckpointMetadata,
+    write_checkpoint,
+    write_state_checkpoint,
+)
+from services.world_model.network.configuration import NetworkConfig
+from services.world_model.network.model import JointWorldModel
 from services.world_model.state_world import StateWorld
 from services.world_model.world import open_world
 from tests.contracts.test_world import untrained_state_checkpoint
@@ -109,6 +116,28 @@ def test_episodes_are_chosen_by_task_and_seed(truth):
         ids(("stack_bowls",), None)
     with pytest.raises(NotFoundError, match="of other seeds"):
         ids(None, range(5, 9))
+
+
+def test_an_episode_without_an_image_of_its_first_step_is_not_imagined(tmp_path):
+    store, item = EpisodeStore(tmp_path), toy.demonstration("reach", 3)
+    toy_store.write(store, item, shown=range(8, toy.STEPS))
+    with pytest.raises(NotFoundError, match="without an image of their first step"):
+        chosen_episodes(store, None, None)
+
+
+def test_episodes_with_few_images_were_never_trained_on_in_the_papers_form(tmp_path):
+    store, item = EpisodeStore(tmp_path / "takes"), toy.demonstration("reach", 3)
+    toy_store.write(store, item, shown=range(0, toy.STEPS, 4))
+    shape = NetworkConfig(
+        image_px=32, video_width=32, tactile_width=32, num_layers=1, num_heads=2, head_width=16
+    )
+    about = CheckpointMetadata(
+        name="x", network=shape, tasks=("reach",), command="x", seed=0, training_steps=0,
+        training_cpu_s=0, train_episode_ids=(), train_fingerprints=("x",), data_hash="x",
+    )  # fmt: skip
+    path = tmp_path / "model.safetensors"
+    write_checkpoint(path, JointWorldModel(shape), about)
+    refuse_trained_episodes(store, store.list(), path, command="evaluate recorded")
 
 
 def test_the_number_of_processes_is_positive():

@@ -13,8 +13,10 @@ MEMINFO = "MemTotal:       16384000 kB\nMemFree:          200000 kB\nMemAvailabl
 # A service with port 0 takes any free one.
 PORTS = {"dashboard": 8080, "episode_store": 8081, "acquisition": 8083, "twin": 0}
 ACCESS = (
+    'sudo groupadd --force dextouch && sudo usermod -aG dextouch "$USER" && '
     "sudo install -m 644 /opt/60-dextouch.rules /etc/udev/rules.d/ && "
-    "sudo udevadm control --reload && sudo udevadm trigger"
+    "sudo udevadm control --reload && sudo udevadm trigger  "
+    "# the rules need your serial numbers; log in again for the group"
 )
 CHRONY = """Reference ID    : C0A80001 (192.168.0.1)
 Stratum         : 3

@@ -168,7 +168,7 @@ def test_a_human_take_that_cannot_be_aligned_is_told(tmp_path, capsys, monkeypat
     def refuse(order):
         raise ClockFitError("stream 'head': stamps fit no clock")
 
-    monkeypatch.setitem(training_data._WRITERS, "devices", refuse)
+    monkeypatch.setattr(training_data, "_written", refuse)
     argv = ["--store", str(tmp_path), "--count", "1", "--tasks", "open_drawer", "--exact"]
     assert training_data.main([*argv, "--domains", "human", "--jobs", "1"]) == 1
     told = capsys.readouterr().out

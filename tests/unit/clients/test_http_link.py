@@ -1,5 +1,6 @@
 """Patience of the HTTP client with a service that is full, restarting, or behind a proxy."""
 
+import json
 import threading
 from contextlib import closing
 from http.server import BaseHTTPRequestHandler, HTTPServer
@@ -8,7 +9,8 @@ import httpx
 import pytest
 
 from dextouch.clients import EpisodeStoreClient, HttpLink, RolloutClient
-from dextouch.errors import ConflictError, InvalidInputError, UnavailableError
+from dextouch.errors import AccessDeniedError, ConflictError, InvalidInputError, UnavailableError
+from dextouch.serving.keys import no_key
 
 PROBLEM = (
     b'{"type": "urn:dextouch:error:UnavailableError", "title": "t", "status": 503, "detail": "d"}'
@@ -87,6 +89,20 @@ def test_a_key_may_end_with_the_end_of_its_file(scripted):
     assert sent == [f"Bearer {key}"]
 
 
+def test_a_refused_key_says_which_service_refused_it(scripted):
+    url, script, _ = scripted
+    detail = no_key("Bearer wrong").message
+    problem = {"type": "urn:dextouch:error:AccessDeniedError", "title": "t", "status": 401}
+    script.append((401, OURS, json.dumps(problem | {"detail": detail}).encode()))
+    with closing(HttpLink(url)) as link, pytest.raises(AccessDeniedError) as refused:
+        link.request("POST", "/v1/any", body=b"")
+    assert refused.value.message == f"POST {url}/v1/any: {detail}"
+    reply = httpx.Response(401, json=problem | {"detail": detail})
+    store = EpisodeStoreClient(url, transport=httpx.MockTransport(lambda _: reply))
+    with pytest.raises(AccessDeniedError, match=f"GET {url}/v1/uploads: unknown key: expected"):
+        store.uploads()
+
+
 def test_it_waits_as_long_as_asked_and_sends_the_same_again(scripted):
     url, script, bodies = scripted
     link, pauses = link_to(url)
@@ -147,3 +163,20 @@ def test_nobody_waits_for_a_service_that_was_never_there(free_port):
     with pytest.raises(UnavailableError, match="is the service running"):
         link.request("GET", "/")
     assert pauses == [0.05, 0.2, 0.8]
+
+
+def test_no_message_has_a_password_of_the_address():
+    problem = {"type": "urn:dextouch:error:AccessDeniedError", "title": "t", "status": 401}
+    replies = iter([httpx.Response(401, json=problem | {"detail": "no"}), httpx.ReadError("cut")])
+
+    def reply(_):
+        if isinstance(one := next(replies), Exception):
+            raise one
+        return one
+
+    transport = httpx.MockTransport(reply)
+    client = EpisodeStoreClient("http://user:s3cret@store.lab:8081", transport=transport)
+    for kind in (AccessDeniedError, UnavailableError):
+        with pytest.raises(kind, match=r"http://store\.lab:8081") as refused:
+            client.uploads()
+        assert "s3cret" not in refused.value.message

@@ -269,6 +269,15 @@ def test_container_and_unit_let_in_the_same_devices():
     assert numbers == set(majors.values())
 
 
+def test_a_container_with_devices_is_no_mock_and_says_which_devices():
+    services = yaml.safe_load((ROOT / "deploy/compose.devices.yml").read_text())["services"]
+    given = services["acquisition"]["environment"]
+    assert given["DEXTOUCH_ACQUISITION_MOCK"] == "false"
+    assert VARIABLE.fullmatch(given["DEXTOUCH_ACQUISITION_DEVICES"])[2] == "?"
+    fields = {name.removeprefix("DEXTOUCH_ACQUISITION_").lower() for name in given}
+    assert fields <= set(AcquisitionSettings.model_fields)
+
+
 def test_prometheus_scrapes_every_service():
     config = yaml.safe_load((ROOT / "deploy/prometheus/prometheus.yml").read_text())
     (job,) = config["scrape_configs"]
@@ -316,6 +325,21 @@ def test_a_station_reports_to_systemd_that_it_works():
     assert "\nRestart=always\n" in unit
     (command,) = re.findall(r"^ExecStart=/opt/dextouch/bin/dextouch (.+)$", unit, re.M)
     assert find_command(command.split())[0] == "station serve"
+
+
+def test_a_station_writes_only_where_its_unit_lets_it():
+    unit = (ROOT / "deploy/systemd/dextouch-station@.service").read_text()
+    (folder,) = re.findall(r"^StateDirectory=(.+)$", unit, re.M)
+    own = f"/var/lib/{folder.replace('%i', 'desk_3')}"
+    guide = (ROOT / "docs/stations.md").read_text()
+    settings = guide[guide.index("# /etc/dextouch/desk_3.env") :].partition("```")[0]
+    places = re.findall(r"^DEXTOUCH_\w+=(/var/lib/.+)$", settings, re.M)
+    assert all(place.startswith(f"{own}/") for place in places), places
+    # Compiled code is kept, too; otherwise every start compiles.
+    for name in ("station@", "alignment"):
+        unit = (ROOT / f"deploy/systemd/dextouch-{name}.service").read_text()
+        (folder,) = re.findall(r"^CacheDirectory=(.+)$", unit, re.M)
+        assert f"\nEnvironment=NUMBA_CACHE_DIR=/var/cache/{folder}\n" in unit
 
 
 SERVED = {

@@ -43,7 +43,7 @@ async def test_who_has_the_answer_is_told_so(http, store, path, monkeypatch):
     assert other.headers["etag"] != tag
     with monkeypatch.context() as patch:
         # Nothing is decoded for an answer that is not sent.
-        patch.setattr(reading_module, "encode_window", None)
+        patch.setattr(reading_module.episodes, "encode_window", None)
         patch.setattr(reading_module, "pack", None)
         for known in (tag, f'"x", W/{tag}', "*"):
             response = await http.get(path, headers={"if-none-match": known})

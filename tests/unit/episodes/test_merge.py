@@ -211,6 +211,23 @@ def test_a_dry_run_says_the_same_and_writes_nothing(stores):
     assert not target.root.exists()
 
 
+@pytest.mark.parametrize("rename", [False, True])
+def test_a_dry_run_of_several_stores_counts_as_the_merge_does(stores, rename):
+    one, two, target = stores
+    for store in (one, two):
+        write_take(store, "take")
+        write_episode(store, "same")
+        write_episode(store, "twice", num_steps=25)
+    write_episode(target, "twice")
+    write_episode(one, "other")
+    write_episode(two, "other", num_steps=30)
+    planned, done = (
+        merge_stores([one, two], target, options=MergeOptions(rename=rename, dry_run=dry_run))
+        for dry_run in (True, False)
+    )
+    assert outcomes(planned) == outcomes(done)
+
+
 def test_a_store_is_not_merged_into_itself_and_an_empty_one_is_named(stores, tmp_path):
     one, two, _ = stores
     write_episode(one, "a")

@@ -289,6 +289,7 @@ def test_estimates_of_development_endings_are_fitted_and_kept_in_the_checkpoint(
 
 
 def test_processes_do_not_change_the_weights():
+    torch.set_num_threads(2)
     one, two = (
         train_success_classifier(
             _episodes(range(30)),

@@ -70,3 +70,4 @@ def test_special_characters_are_escaped():
     assert escape_latex("50% of a_b & {c} #1 $x ~y^2 \\z") == (
         r"50\% of a\_b \& \{c\} \#1 \$x \textasciitilde{}y\textasciicircum{}2 \textbackslash{}z"
     )
+    assert escape_latex("<a|b>") == r"\textless{}a\textbar{}b\textgreater{}"

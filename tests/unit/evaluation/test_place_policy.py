@@ -10,8 +10,9 @@ from dextouch.clients import PolicyStart
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import InvalidInputError, UnknownNameError
 from dextouch.hands.actions import IDENTITY_POSE_9D, POSE_SLICES
+from dextouch.schemas import Observation
 from services.cli.main import run_command
-from services.evaluation.bundled_policies import bundled_policy
+from services.evaluation.bundled_policies import bundled_policy, trained_policy
 from services.evaluation.policies.behaviour_cloning import action_weights
 from services.evaluation.trained_networks import load_checkpoint
 from services.pipelines.place_policy import (
@@ -20,15 +21,18 @@ from services.pipelines.place_policy import (
     Motion,
     PlacePolicy,
     Places,
+    _motion_of,
     read_places,
     train_place_policy,
 )
 from services.world_model.checkpoints import write_state_checkpoint
 from services.world_model.dynamics.features import DynamicsConfig
 from services.world_model.dynamics.model import DynamicsModel
+from services.world_model.dynamics.start_reader import StartReader
 from tests.contracts.test_world import untrained_state_checkpoint
 from tests.unit.evaluation import toy
 from tests.unit.evaluation.toy_store import write
+from tests.unit.other_gloves import small_layout
 
 PX = 32
 SEEDS = range(1, 13)
@@ -118,6 +122,32 @@ def test_motions_survive_their_tensors_and_broken_ones_are_refused():
             Motion.from_tensors(tensors)
 
 
+def test_tasks_whose_names_have_dots_keep_their_own_motion():
+    targets, places = drawn(12, seed=0)
+    motions = {task: Motion.fitted(places, motions_to(targets, steps))
+               for task, steps in (("pick", 20), ("pick.fast", 10))}  # fmt: skip
+    tensors = {f"motion.{task}.{name}": one for task, motion in motions.items()
+               for name, one in motion.tensors().items()}  # fmt: skip
+    for task, motion in motions.items():
+        assert len(_motion_of(task, tensors).mean_motion) == len(motion.mean_motion)
+
+
+def test_places_are_read_with_any_glove():
+    layout = small_layout()
+    config = DynamicsConfig(
+        tasks=("reach",), num_objects=(1,), image_px=PX, touch_channels=8, layout=layout
+    )
+    seen = Observation(
+        first_step=0,
+        images={"camera_head": np.zeros((1, PX, PX, 3), np.uint8)},
+        tactile_kpa=np.zeros((1, 2, layout.num_taxels), np.float32),
+        action_reached=motions_to(np.zeros((1, 3)))[0, :1],
+        reached_is_measured=True,
+    )
+    readers = [StartReader(config).eval()]
+    assert read_places(readers, config, "reach", seen, toy.ANCHOR, toy.K_HEAD).axes.shape == (1, 6)
+
+
 @pytest.fixture(scope="module")
 def model(tmp_path_factory):
     """A state model of random weights that knows the toy task."""
@@ -168,7 +198,7 @@ def test_the_file_is_loaded_as_any_trained_policy(policy_file, store):
 
 
 def test_chunks_are_those_of_one_motion_and_the_end_is_held(policy_file, store):
-    policy = PlacePolicy.load(policy_file)
+    policy = trained_policy(policy_file)
     one = started(policy, store.open(store.list()[0]))
     first = policy.act(one.first)
     assert first.shape == (16, 67)
@@ -182,7 +212,7 @@ def test_chunks_are_those_of_one_motion_and_the_end_is_held(policy_file, store):
 
 
 def test_what_it_cannot_do_is_refused(policy_file, model, store):
-    policy = PlacePolicy.load(policy_file)
+    policy = trained_policy(policy_file)
     reader = store.open(store.list()[0])
     one = Demonstration.of(reader, PX)
     with pytest.raises(InvalidInputError, match="act before reset"):
@@ -201,7 +231,8 @@ def test_what_it_cannot_do_is_refused(policy_file, model, store):
     with pytest.raises(UnknownNameError, match="task of the place policy"):
         read_places([], config, "reach", one.first, one.grid.anchor, one.grid.K_head)
     flags = ["--episodes", str(store.root), "--places", str(model), "--early-at", "0.5"]
-    with pytest.raises(InvalidInputError, match="got --early-at"):
+    flags += ["--training.batch-size", "8"]
+    with pytest.raises(InvalidInputError, match="got --early-at and --training,"):
         run_command(["train", "policy", *flags])
 
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dextouch.episodes import EpisodeStore
 from dextouch.errors import InvalidInputError
 from dextouch.geometry import pinhole_matrix, transform
 from dextouch.hands.actions import IDENTITY_POSE_9D, POSE_SLICES, AnchorPoses
@@ -18,7 +19,8 @@ from services.evaluation.prediction import (
     MODEL,
     measure_prediction,
 )
-from services.evaluation.prediction_scenes import Future, Scene, other_take
+from services.evaluation.prediction_scenes import Future, Scene, other_take, read_windows
+from tests.unit.evaluation import toy, toy_store
 
 PX, NUM_STEPS = 16, 32
 DOWN = np.diag([1.0, -1.0, -1.0])
@@ -129,6 +131,14 @@ def test_a_lone_scene_has_no_other_and_no_scene_is_refused():
     assert "psnr_other_take" not in measure_prediction(world, [scene(1, 0.1)]).flat()
     with pytest.raises(InvalidInputError, match="no scene"):
         measure_prediction(world, [])
+
+
+def test_windows_that_begin_without_an_image_or_have_none_are_left_out(tmp_path):
+    item = toy.demonstration("reach", 3)
+    store = EpisodeStore(tmp_path)
+    toy_store.write(store, item, shown=[*range(16), *range(17, 49), *range(65, 80)])
+    windows = read_windows(store.open(item.episode_id))
+    assert [window.first_step for window in windows] == [0, 32]
 
 
 def recorded(episode_id, depth_m):

@@ -87,6 +87,18 @@ async def test_a_rater_rates_everything_without_learning_what_it_is(settings, tm
     assert "reach: score 0.67 over 2 rollouts, 1 raters" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("missing", ["store_url", "marks"])
+def test_a_report_of_a_store_or_marks_that_are_not_there_is_refused(
+    settings, tmp_path, capsys, missing
+):
+    MarkLog(settings["marks"])
+    given = settings | {missing: tmp_path / "missing"}
+    flags = [f"--{name.replace('_', '-')}={value}" for name, value in given.items()]
+    assert main(["rate", "report", *flags]) == 3
+    assert "missing: no such" in capsys.readouterr().err
+    assert not given[missing].exists()
+
+
 async def test_the_report_compares_people_with_the_twin(settings, tmp_path):
     store = EpisodeStore(settings["store_url"])
     noted = toy.demonstration("reach", 3, name="noted")

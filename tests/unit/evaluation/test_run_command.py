@@ -6,15 +6,32 @@ from pathlib import Path
 
 import pytest
 
+from dextouch.episodes import EpisodeStore, split_of_scene
 from dextouch.errors import InvalidInputError
 from dextouch.worlds import WorldServiceSettings, create_world_app
-from services.evaluation.command_line import run_evaluation
+from services.evaluation.command_line import run_evaluation, run_train_judge
 from services.evaluation.policies.user_policies import load_policies
 from services.evaluation.scores import REAL
 from services.evaluation.settings import command_line
 from services.evaluation.trained_networks import save_checkpoint
-from tests.unit.evaluation import toy
+from tests.unit.evaluation import toy, toy_store
 from tests.unit.worlds.running import served
+
+
+@pytest.mark.long
+def test_a_judge_is_measured_on_any_split_of_a_held_out_store(tmp_path):
+    urls = {"A": tmp_path / "learned", "B": tmp_path / "learned", "C": tmp_path / "held"}
+    for seed in range(60):
+        item = toy.demonstration("reach", seed, noise_m=0.0 if seed % 2 else 0.09)
+        toy_store.write(EpisodeStore(urls[split_of_scene("reach", seed)]), item)
+    figures = tmp_path / "figures.json"
+    run_train_judge([
+        "--episodes", str(urls["A"]), "--splits", "A,B", "--held-out", str(urls["C"]),
+        "--training.num-training-steps", "1", "--jobs", "1", "--image-px", "32",
+        "--output", str(tmp_path / "judge.safetensors"), "--json", str(figures),
+    ])  # fmt: skip
+    num_held_out = json.loads(figures.read_text())["metrics"]["num_held_out_episodes"]
+    assert num_held_out == len(EpisodeStore(urls["C"]).list())
 
 
 def test_a_recorded_command_names_every_file_by_its_last_part():

@@ -8,9 +8,14 @@ import torch
 from scipy.stats import mannwhitneyu
 
 from dextouch.episodes import split_by_scene
-from dextouch.errors import ConflictError, InvalidInputError, UnknownNameError
-from services.evaluation.success_classifier import ClassifierShape, SuccessClassifier
+from dextouch.errors import ConflictError, InvalidInputError, NonFiniteError, UnknownNameError
+from services.evaluation.success_classifier import (
+    ClassifierNetwork,
+    ClassifierShape,
+    SuccessClassifier,
+)
 from services.evaluation.success_classifier_training import (
+    ClassifierSets,
     ClassifierSettings,
     calibrate_success_classifier,
     labelled_endings,
@@ -89,6 +94,30 @@ def test_a_start_never_stands_on_both_sides(demonstrations):
     training, held_out = split_by_scene(twice, held_out_share=0.3)
     assert len(training) + len(held_out) == len(twice)
     assert not {d.start_digest for d in training} & {d.start_digest for d in held_out}
+
+
+def test_what_was_imagined_of_a_held_out_scene_is_not_trained_on(demonstrations):
+    episodes = _episodes(demonstrations)
+    # As a world that sees smaller images than the take has.
+    imagined = replace(episodes[3], episode_id="imagined", start_digest="another")
+    for others in ({"held_out": [imagined]}, {"development": [imagined]}):
+        with pytest.raises(ConflictError, match=f"1 scenes were trained on .*{imagined.scene};"):
+            ClassifierSets.split(episodes, ClassifierSettings(), **others)
+
+
+def test_tasks_have_any_name(demonstrations):
+    names = ("v1.2 pick", "pop", "training", "a/b", "reach")
+    network = ClassifierNetwork(ClassifierShape(tasks=names))
+    assert len({id(network.of(name)) for name in names}) == len(names)
+    assert any(name.startswith("tasks.reach.") for name in network.state_dict())
+    with pytest.raises(InvalidInputError, match="two have one name"):
+        ClassifierNetwork(ClassifierShape(tasks=("a.b", "a%2Eb")))
+
+
+def test_a_training_that_diverges_is_named(demonstrations):
+    settings = ClassifierSettings(num_training_steps=20, learning_rate=1e30)
+    with pytest.raises(NonFiniteError, match="gradients of step"):
+        train_success_classifier(_episodes(demonstrations), settings, command="x")
 
 
 def test_it_is_measured_on_the_held_out_episodes_it_is_given(demonstrations):

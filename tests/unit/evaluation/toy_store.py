@@ -44,4 +44,4 @@ def write(
             values, fields = streams[name]
             writer.add_stream(StreamDescriptor(name=name, nominal_rate_hz=15, **fields))
             steps = list(shown) if fields["kind"] == "image" else slice(None)
-            writer.append(name, values=values[steps], t_ref_ns=GRID_NS[steps])
+            writer.append(name, values=values[steps], t_ref_ns=GRID_NS[: len(values)][steps])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dextouch.clients import RolloutClient
-from dextouch.episodes import EpisodeStore, check_id
+from dextouch.episodes import EpisodeGrid, EpisodeStore, check_id
 from dextouch.errors import InvalidInputError
 from dextouch.images import scaled_square
 from dextouch.schemas import EVERYTHING, Uncertainty
@@ -18,6 +18,7 @@ from services.twin.episodes import record, write_episode
 from services.twin.settings import TwinSettings
 from services.twin.stage import Stage
 from services.twin.take_options import TakeOptions
+from tests.unit.evaluation import toy, toy_store
 
 
 @pytest.fixture(scope="module")
@@ -65,6 +66,23 @@ def test_an_imagined_episode_shows_what_the_world_showed(sources, client, tmp_pa
     )
     np.testing.assert_array_equal(window.tactile_kpa[40], truth.tactile_kpa[0])
     np.testing.assert_allclose(window.actions, truth.actions, atol=1e-9)
+
+
+def test_the_lens_and_refused_taxels_of_a_source_are_not_those_of_the_world(client, tmp_path):
+    spans = ((1.0, 2.0),)
+    calibration = {
+        "distortion_head": ((-0.3, 0.1, 0.0, 0.0, 0.0),), "interpolated_wrist_left_s": spans,
+        "tactile_left_refused_taxels": ((1.0,) * 100 + (0.0,) * 220,),
+    }  # fmt: skip
+    take = replace(toy.demonstration("reach", 3), task="stack_bowls")
+    take = replace(take, images=take.images.repeat(2, axis=1).repeat(2, axis=2))
+    store = EpisodeStore(tmp_path)
+    toy_store.write(store, take, calibration=calibration)
+    source = EpisodeGrid(store.open(take.episode_id))
+    imagined = EpisodeGrid(store.open(imagine_episode(source.reader, client, "copy-first", store)))
+    np.testing.assert_array_equal(imagined.images([0]), source.images([0]))
+    assert imagined.measured_taxels.all()
+    assert imagined.about.calibration == {"interpolated_wrist_left_s": spans}
 
 
 def test_an_episode_of_another_rate_is_refused(sources, tmp_path):

@@ -233,6 +233,11 @@ async def test_readiness_follows_lifespan_and_check():
             "service": "probe",
             "version": __version__,
         }
+        # As monitors and load balancers ask.
+        assert [(await client.head(path)).status_code for path in ("/healthz", "/readyz")] == [
+            200,
+            503,
+        ]
         early = await client.get("/readyz")
         assert (early.status_code, early.json()["waiting_for"]) == (503, ["start"])
         async with app.router.lifespan_context(app):

@@ -93,7 +93,6 @@ def test_no_page_shows_a_key_that_settings_would_accept(monkeypatch):
     for page in pages:
         for match in literal.finditer(page.read_text()):
             key = match[1] or match[2]
-            if key.startswith(("$", "'")):
-                continue
-            with pytest.raises(InvalidInputError):
-                load(key, monkeypatch)
+            if not key.startswith("$"):
+                with pytest.raises(InvalidInputError):
+                    load(key, monkeypatch)

@@ -167,6 +167,16 @@ def test_a_tracker_whose_clock_runs_slowly_is_followed_for_an_hour():
     assert not follower.refused
 
 
+@pytest.mark.parametrize("off_s", [-10, 10])
+def test_a_first_sample_of_another_time_delays_nothing(off_s):
+    follower = HandFollower(SIDE, CommandLimits(), RATE_HZ, {})
+    for index in range(122):
+        t_device_ns = sample(index).t_device_ns + (0 if index else off_s * 10**9)
+        follower.receive(HandSample(sample(index).keypoints_m, t_device_ns), 5.0 + index / 60)
+    assert follower.refused == {"time": 1}
+    assert follower.can_check
+
+
 def test_a_stop_holds_until_the_next_start(run):
     run.follower.stop()
     held = run.play(10.0)

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from services.world_model.dynamics.start_reader import FirstStep, StartReader
-from services.world_model.training.reader_training import as_another_camera
+from services.world_model.training.member_training import as_another_camera
 from tests.unit.world_model.test_dynamics import CONFIG, NUM_POINTS
 
 PX = 64

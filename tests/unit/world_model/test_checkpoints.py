@@ -1,6 +1,7 @@
 """A checkpoint comes back as it was stored, or not at all."""
 
 import json
+import resource
 
 import pytest
 import torch
@@ -12,6 +13,7 @@ from dextouch.errors import (
     LimitExceededError,
     NonFiniteError,
     NotFoundError,
+    StorageError,
 )
 from services.networks.weight_files import read_weights
 from services.world_model import checkpoints, shipped_checkpoints
@@ -147,6 +149,24 @@ def test_a_cut_off_file_is_refused(path, tiny_model, metadata):
     path.write_bytes(path.read_bytes()[:-100])
     with pytest.raises(CorruptDataError):
         read_checkpoint(path)
+
+
+def test_a_disk_that_is_full_is_named_and_nothing_is_left_on_it(path, tiny_model, metadata):
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, hard))
+    try:
+        with pytest.raises(StorageError, match=r"write .*free space"):
+            write_checkpoint(path, tiny_model, metadata)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert not list(path.parent.glob("*.partial"))
+
+
+def test_an_output_that_cannot_be_a_file_is_refused(tmp_path, tiny_model, metadata):
+    for output in (tmp_path, tmp_path / "file" / "model.safetensors"):
+        (tmp_path / "file").touch()
+        with pytest.raises(StorageError, match="write "):
+            write_checkpoint(output, tiny_model, metadata)
 
 
 def test_checkpoints_are_listed_with_their_digests(tmp_path, tiny_model, metadata):

@@ -16,21 +16,35 @@ from services.twin.episodes import record, write_episode
 from services.twin.settings import TwinSettings
 from services.twin.stage import Stage
 from services.twin.take_options import TakeOptions
-from services.world_model.checkpoints import read_state_checkpoint, write_state_checkpoint
+from services.world_model.checkpoints import (
+    StateBounds,
+    read_state_checkpoint,
+    write_state_checkpoint,
+)
 from services.world_model.dynamics.features import TouchCodec
 from services.world_model.settings import CoreSettings, ReaderSettings, StateTrainSettings
-from services.world_model.training import state_data
-from services.world_model.training.core_training import CoreData, _read_start, start_steps
-from services.world_model.training.reader_training import read_step, train_reader
+from services.world_model.training import state_data, state_trainer
+from services.world_model.training.member_training import (
+    CoreData,
+    _read_start,
+    read_step,
+    start_steps,
+    train_reader,
+)
 from services.world_model.training.scene_table import SceneTable, scene_table
 from services.world_model.training.state_data import (
+    StateData,
     check_drawable,
+    check_new,
+    configured,
+    drawn_episodes,
     has_poses,
     labelled_episodes,
     load_scene_episodes,
     load_state_data,
 )
 from services.world_model.training.state_trainer import train_state
+from services.world_model.training.transfer import Base
 from tests.contracts.test_world import untrained_state_checkpoint
 from tests.unit.world_model.test_state_training import (  # noqa: F401 (fixture)
     PX,
@@ -338,6 +352,44 @@ def test_takes_without_poses_are_notlabelled_episodes():
     assert labelled_episodes([clicked(0), unposed(1)], settings) == [True, False]
     with pytest.raises(InvalidInputError, match="no scene with known objects of press"):
         labelled_episodes([unposed(1)], settings)
+
+
+def test_renderers_see_robots_with_poses_though_those_of_a_task_have_none():
+    people = [changed(clicked(n), domain="human") for n in range(2)]
+    other = changed(episode(7), task="lift")
+    data = StateData([*people, unposed(3), other], [episode(8)])
+    assert drawn_episodes(data, StateTrainSettings(episodes=("takes",))) == [other]
+
+
+def test_objects_of_unknown_size_are_refused():
+    boxless = [changed(episode(seed), boxes_m=np.zeros((0, 6))) for seed in range(2)]
+    data = StateData(boxless[:1], boxless[1:])
+    with pytest.raises(InvalidInputError, match=r"sizes of the objects of tasks \['press'\]"):
+        configured(data, StateTrainSettings(episodes=("takes",)))
+
+
+def test_a_model_has_the_rate_of_its_episodes(tmp_path):
+    fast = [changed(episode(seed), model_rate_hz=30.0) for seed in range(2)]
+    data = StateData(fast[:1], fast[1:])
+    settings = StateTrainSettings(episodes=("takes",), num_members=1)
+    work = state_trainer._Work(
+        settings, configured(data, settings), tmp_path, "", reads_starts=False
+    )
+    about = state_trainer._metadata(work, data, StateBounds(), {}, command="", cpu_s=0.0)
+    assert about.model_rate_hz == 30.0
+    base, path = untrained_state_checkpoint(), tmp_path / "base.safetensors"
+    write_state_checkpoint(path, base.dynamics, base.renderer, base.metadata)
+    with pytest.raises(InvalidInputError, match="steps at 15 Hz, the episodes at 30 Hz"):
+        check_new(data, settings, Base(path))
+
+
+def test_held_out_takes_below_a_chunk_are_refused_before_training(monkeypatch, tmp_path):
+    data = StateData([episode(0), episode(1)], [episode(2, 13)])
+    monkeypatch.setattr(state_data, "load_state_data", lambda _: data)
+    monkeypatch.setattr(state_trainer, "_train_parts", lambda _: pytest.fail("trained"))
+    settings = StateTrainSettings(episodes=("takes",), output=tmp_path / "model.safetensors")
+    with pytest.raises(InvalidInputError, match="longest held-out episode has 13 steps"):
+        train_state(settings)
 
 
 def test_clicks_alone_need_a_base():

@@ -6,13 +6,17 @@ import numpy as np
 import pytest
 import torch
 
+from dextouch.episodes import EpisodeStore
 from dextouch.errors import InvalidInputError
 from services.world_model.training.joint_dataset import (
     WindowPosition,
     WindowSampler,
+    index_episodes,
     load_episodes,
     read_episode,
 )
+from tests.unit.evaluation import toy
+from tests.unit.evaluation import toy_store as toy_store_of_takes
 
 
 @pytest.mark.parametrize("kind", ["measured", "commanded"])
@@ -87,6 +91,16 @@ def test_a_store_is_loaded_whole(toy_store, toy_episodes):
     loaded = load_episodes(str(toy_store.root))
     assert [e.episode_id for e in loaded] == [e.episode_id for e in toy_episodes]
     assert loaded[2].fingerprint() == toy_episodes[2].fingerprint()
+
+
+@pytest.mark.parametrize("read", [load_episodes, index_episodes])
+def test_episodes_with_smaller_images_are_left_out(read, tmp_path):
+    store, item = EpisodeStore(tmp_path), toy.demonstration("reach", 1)
+    toy_store_of_takes.write(store, item)
+    small = replace(item, episode_id="small", images=item.images[:, :24])
+    toy_store_of_takes.write(store, small)
+    found = read(str(store.root), image_px=toy.SIZE)
+    assert [one.episode_id for one in found] == [item.episode_id]
 
 
 def test_every_start_is_drawn_the_last_one_too(toy_episode):

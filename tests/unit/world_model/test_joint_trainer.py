@@ -8,7 +8,7 @@ import pytest
 import torch
 from safetensors import safe_open
 
-from dextouch.errors import InvalidInputError
+from dextouch.errors import ConflictError, InvalidInputError
 from services.world_model.checkpoints import METADATA_KEY, read_checkpoint
 from services.world_model.training import evaluation
 from services.world_model.training.episode_sets import check_disjoint
@@ -115,6 +115,29 @@ def test_held_out_episodes_cannot_be_trained_on(toy_episodes, heldout, train_set
     same_scene = replace(heldout[0], scene=toy_episodes[1].scene)
     with pytest.raises(InvalidInputError, match="same scene"):
         train_on(toy_episodes, [same_scene], train_settings)
+
+
+def test_held_out_episodes_without_a_window_are_refused_before_training(
+    toy_episodes, toy_episode, train_settings, monkeypatch
+):
+    monkeypatch.setattr(TrainingRun, "run", lambda *_: pytest.fail("trained"))
+    with pytest.raises(InvalidInputError, match="without a window of 17 steps"):
+        train_on(toy_episodes, [toy_episode(70, 12)], train_settings)
+
+
+@pytest.mark.long
+def test_a_model_has_the_rate_of_its_episodes(toy_episodes, heldout, train_settings):
+    fast, others = ([replace(one, model_rate_hz=30.0) for one in some]
+                    for some in (toy_episodes, heldout))  # fmt: skip
+    settings = train_settings.model_copy(update={"max_steps": 1})
+    report = train_on(fast, others, settings)
+    assert read_checkpoint(report.checkpoint).metadata.network.model_rate_hz == 30.0
+    network = settings.network.model_copy(update={"model_rate_hz": 20.0})
+    with pytest.raises(ConflictError, match="is 20 Hz, the episodes have steps at 30 Hz"):
+        train_on(fast, others, settings.model_copy(update={"network": network}))
+    slow = settings.model_copy(update={"network": network, "init": report.checkpoint})
+    with pytest.raises(ConflictError, match=r"safetensors has steps at 20 Hz.*align them at its"):
+        train_on(fast, others, slow)
 
 
 def test_training_episodes_cannot_be_judged_on(tiny_model, toy_episodes):

@@ -135,6 +135,18 @@ def test_tasks_that_people_and_robots_share_are_refused_unless_allowed(settings)
     check_tasks([*robots, *people, *heldout], allowed)
 
 
+def test_people_in_held_out_scenes_are_not_trained_on(settings, tmp_path):
+    _, heldout = load_split(settings)
+    store = EpisodeStore(tmp_path / "people")
+    for number, one in enumerate((heldout[0], make_episode(777))):
+        human = replace(human_episode(120 + number), task=one.task, scene=one.scene)
+        write_episode(store, human)
+    given = {"human": (str(store.root),), "human_episodes": None, "disjoint_tasks": False}
+    trained, _ = load_split(settings.model_copy(update=given))
+    assert not {one.scene for one in trained} & {one.scene for one in heldout}
+    assert [one.scene for one in trained if one.domain == "human"] == ["push_box/777"]
+
+
 @pytest.mark.long
 def test_a_checkpoint_proves_what_it_was_trained_on(settings):
     report = train(settings.model_copy(update={"max_steps": 1}))

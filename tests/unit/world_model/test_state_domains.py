@@ -30,7 +30,7 @@ from services.world_model.settings import (
     StateTrainSettings,
     TrainStateCommand,
 )
-from services.world_model.training.core_training import CoreData, _draw, core_loss, touch_latents
+from services.world_model.training.member_training import CoreData, _draw, core_loss, touch_latents
 from services.world_model.training.scene_table import scene_table
 from services.world_model.training.state_data import StateData, configured, load_state_data
 from services.world_model.training.state_trainer import _command, train_state

@@ -15,7 +15,7 @@ from services.world_model.dynamics.features import (
 )
 from services.world_model.settings import CoreLossWeights, CoreSettings, StateTrainSettings
 from services.world_model.state_world import StateWorld
-from services.world_model.training.core_training import CoreData, touch_latents, train_core
+from services.world_model.training.member_training import CoreData, touch_latents, train_core
 from services.world_model.training.scene_table import scene_table
 from services.world_model.training.state_data import StateData, configured
 from services.world_model.training.transfer import Base

@@ -1,6 +1,7 @@
 """Start readers and cores learn a toy scene: a bright block that a descending hand presses."""
 
 import dataclasses
+import shlex
 from collections import Counter
 from pathlib import Path
 
@@ -14,7 +15,6 @@ from dextouch.geometry import apply, invert, pinhole_matrix, project, transform
 from dextouch.hands.actions import IDENTITY_POSE_9D, POSE_SLICES, AnchorPoses
 from dextouch.schemas import MAX_OBJECTS, EpisodeAttributes, StoredAnchor, matrix_rows
 from dextouch.serving import load_settings
-from services.world_model.checkpoints import StateBounds
 from services.world_model.dynamics.core import RecurrentCore, SceneStart
 from services.world_model.dynamics.features import SLOT_SIZE, DynamicsConfig, TouchCodec
 from services.world_model.dynamics.model import DynamicsModel
@@ -25,7 +25,8 @@ from services.world_model.settings import (
     ReaderSettings,
     TrainStateCommand,
 )
-from services.world_model.training.core_training import (
+from services.world_model.training.evaluation import evaluate_dynamics
+from services.world_model.training.member_training import (
     CoreData,
     _draw,
     _is_settled,
@@ -33,12 +34,13 @@ from services.world_model.training.core_training import (
     _read_start,
     core_loss,
     describe,
+    read_step,
+    reader_errors,
     start_steps,
     touch_latents,
     train_core,
+    train_reader,
 )
-from services.world_model.training.evaluation import evaluate_dynamics
-from services.world_model.training.reader_training import read_step, reader_errors, train_reader
 from services.world_model.training.scene_table import (
     SceneTable,
     scene_table,
@@ -142,13 +144,13 @@ def test_a_core_feels_what_it_touches_and_nothing_elsewhere(reader, table, held_
     settings = CoreSettings(num_steps=250, batch=16)
     dynamics.eyes[0] = reader
     dynamics.core = train_core(data, config, settings, seed=0)
-    measured = evaluate_dynamics(dynamics.eval(), held_out)
-    assert measured.figures["contact_f1_chunk_1"] > 0.8
-    assert measured.figures["contact_f1_chunk_1_of_copy"] == 0.0
-    assert measured.figures["final_object_mm_press"] < 25
-    assert measured.disagreement_m == 0.0
-    assert measured.figures["object_mm_chunk_1"] < 25
-    assert StateBounds(distance=measured.distance).distance > 0
+    figures, bounds = evaluate_dynamics(dynamics.eval(), held_out)
+    assert figures["contact_f1_chunk_1"] > 0.8
+    assert figures["contact_f1_chunk_1_of_copy"] == 0.0
+    assert figures["final_object_mm_press"] < 25
+    assert bounds.disagreement_m == 0.0
+    assert figures["object_mm_chunk_1"] < 25
+    assert bounds.distance > 0
 
 
 @pytest.mark.long
@@ -255,7 +257,7 @@ def test_rollouts_from_the_middle_are_measured_with_true_context(config):
     held_out = scene_table([episode(seed, 49) for seed in range(1000, 1008)], config)
     torch.manual_seed(0)
     dynamics = DynamicsModel(config, num_members=2).eval()
-    measured = evaluate_dynamics(dynamics, held_out).figures
+    measured, _ = evaluate_dynamics(dynamics, held_out)
     chunks = {0: 3, 16: 2, 32: 1}
     for start, count in chunks.items():
         place = f"from_{start}_" if start else ""
@@ -547,12 +549,14 @@ def test_the_command_in_a_checkpoint_can_be_typed_again():
         tasks=("press",),
         init=Path("/models/cores.safetensors"),
         core=CoreSettings(num_steps=7, weights=CoreLossWeights(touch=0.0)),
+        name="first try",
         json=Path("/somewhere/figures.json"),
     )
     command = _command(settings)
     assert command.startswith("dextouch train world-model --episodes=takes --episodes=more ")
     assert "/" not in command
-    again = load_settings(TrainStateCommand, command.split()[3:])
+    again = load_settings(TrainStateCommand, shlex.split(command)[3:])
+    assert again.name == "first try"
     assert again.core.num_steps == 7
     assert again.init == Path("cores.safetensors")
     assert again.core.weights.touch == 0.0

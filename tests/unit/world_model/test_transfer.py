@@ -11,13 +11,14 @@ from services.world_model.checkpoints import write_state_checkpoint
 from services.world_model.dynamics.core import direction_free_inputs
 from services.world_model.dynamics.features import DynamicsConfig, TouchCodec
 from services.world_model.settings import CoreSettings, ReaderSettings, StateTrainSettings
-from services.world_model.training.core_training import (
+from services.world_model.training.member_training import (
     CoreData,
     _read_start,
+    read_step,
     touch_latents,
     train_core,
+    train_reader,
 )
-from services.world_model.training.reader_training import read_step, train_reader
 from services.world_model.training.scene_table import scene_table
 from services.world_model.training.state_data import seed_ranges, splits_by_task, trained_splits
 from services.world_model.training.state_trainer import (

@@ -19,6 +19,7 @@ from dextouch.bridges.import_recording import (
     file_sha256,
     printable,
     stream_names,
+    whole_text,
 )
 from dextouch.bridges.lerobot import layout
 from dextouch.bridges.lerobot.layout import WORLD
@@ -38,7 +39,6 @@ from dextouch.bridges.lerobot.source import (
     EpisodeEntry,
     FeatureInfo,
     LeRobotFolder,
-    whole_text,
 )
 from dextouch.episodes import EpisodeStore, Kind
 from dextouch.errors import (

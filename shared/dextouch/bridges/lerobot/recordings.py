@@ -27,10 +27,11 @@ from dextouch.bridges.import_recording import (
     new_attributes,
     recording_id_of,
     stream_names,
+    whole_text,
     write_recording,
 )
 from dextouch.bridges.lerobot import layout
-from dextouch.bridges.lerobot.source import EpisodeEntry, FeatureInfo, LeRobotFolder, whole_text
+from dextouch.bridges.lerobot.source import EpisodeEntry, FeatureInfo, LeRobotFolder
 from dextouch.bridges.lerobot.video import read_images, read_units
 from dextouch.episodes import GOP_IMAGES, EpisodeStore, is_keyframe
 from dextouch.errors import CorruptDataError, InvalidInputError

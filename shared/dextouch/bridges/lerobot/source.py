@@ -13,7 +13,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from dextouch.bridges.import_recording import remedy
+from dextouch.bridges.import_recording import remedy, whole_text
 from dextouch.bridges.lerobot import layout
 from dextouch.bridges.lerobot.video import VideoSpan
 from dextouch.data_folder import is_system_file
@@ -41,11 +41,6 @@ _IMAGE_PATHS = (
     "images/{image_key}/episode_{episode_index:06d}/frame_{frame_index:06d}",
 )
 _IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tiff")
-
-
-def whole_text(value: object) -> str:
-    """Text of a value without half surrogates, which JSON can hold and UTF-8 cannot."""
-    return str(value).encode(errors="replace").decode()
 
 
 class FeatureInfo(BaseModel):

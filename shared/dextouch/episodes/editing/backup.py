@@ -116,8 +116,7 @@ def back_up(
         NotFoundError: the source has no folder.
     """
     _check_apart(source, target, "backup")
-    if source.folders and not source.root.is_dir():
-        raise NotFoundError(f"backup: store {source.root}: no such folder; mount or name it")
+    source.require_folder()
     with disk_errors(f"back up to {target.root}"):
         target.root.mkdir(parents=True, exist_ok=True)
     # Another backup to the same place ends first; in a bucket, one from this machine.

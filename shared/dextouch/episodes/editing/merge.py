@@ -112,6 +112,9 @@ class _Origins:
 
     def __init__(self, store: EpisodeStore) -> None:
         self._store = store
+        # What a dry run would have copied so far: hashes by kind and new id, and the reverse.
+        self.planned: dict[tuple[str, str], str] = {}
+        self.planned_ids: dict[tuple[str, str], str] = {}
 
     @cached_property
     def _found(self) -> defaultdict[tuple[str, str], list[LineageEntry]]:
@@ -178,8 +181,9 @@ class _Merge:
                 f"{name!r}: it, its recording or its operator was permanently deleted from the "
                 f"target on {covered.deleted_at:%Y-%m-%d}"
             )
-        is_taken = target.exists(name, kind=kind)
-        ours = target.open_item(kind, name).content_sha256 if is_taken else None
+        if (planned_id := self.origins.planned_ids.get((kind, sha256))) is not None:
+            return MergeReport(kind, name, source.url, "there", planned_id)
+        ours = self._sha256_in_target(kind, name)
         remarks = self._remarks(kind, name)
         if ours == sha256:
             moved = self._add_remarks(kind, name, remarks)
@@ -195,25 +199,34 @@ class _Merge:
             reason = "deleted: it is in the trash" if made.operation else ""
             return MergeReport(kind, name, source.url, "there", made.id, reason=reason)
         new_id, attributes = name, reader.attributes
-        if is_taken:
+        if ours is not None:
             if not self.options.rename:
                 reason = f"{kind} {name!r} of the target has other content; --rename copies it too"
                 return MergeReport(kind, name, source.url, "refused", reason=reason)
             ids = numbered_ids(name, "merged")
-            new_id = next(one for one in ids if not target.exists(one, kind=kind))
+            new_id = next(one for one in ids if self._sha256_in_target(kind, one) is None)
             lineage = (*map(self._in_target, attributes.lineage), entry)
             changes = {f"{kind}_id": new_id, "lineage": lineage}
             attributes = attributes.model_copy(update=changes)
-        if not self.options.dry_run:
+        if self.options.dry_run:
+            self.origins.planned[kind, new_id] = sha256
+            self.origins.planned_ids[kind, sha256] = new_id
+        else:
             reader.verify()
             copy_item(source, target, reader, attributes, remarks)
             copied = target.open_item(kind, new_id).content_sha256
             self._note_results(kind, new_id, copied, remarks)
-            if is_taken:
+            if ours is not None:
                 item = LineageEntry(kind=kind, id=new_id, sha256=copied)
                 self._rename(entry, item)
                 self.origins.add(entry, item)
         return MergeReport(kind, name, source.url, "copied", new_id)
+
+    def _sha256_in_target(self, kind: Kind, name: str) -> str | None:
+        """Hash of what the target has by this id, or would have after a dry run; None if free."""
+        if self.target.exists(name, kind=kind):
+            return self.target.open_item(kind, name).content_sha256
+        return self.origins.planned.get((kind, name))
 
     def _rename(self, before: LineageEntry, after: LineageEntry) -> None:
         self.renamed[before.kind, before.id] = before, after

@@ -149,13 +149,16 @@ def test_stamps_that_go_back_are_not_sent_and_a_restarted_clock_is(name, serve, 
         outlet.push(np.zeros(CHANNELS), start_s - 0.05)
     # Before this computer was started, which no packet can say.
     outlet.push(np.zeros(CHANNELS), -1e6)
+    # No time at all.
+    outlet.push(np.zeros(CHANNELS), np.nan)
+    outlet.push(np.zeros(CHANNELS), np.inf)
     # Half of the time since then, and on from there: another clock.
     stamps = iter(start_s / 2 + 0.002 * np.arange(10_000))
     again = pushing(outlet, driver, 3, stamp_s=lambda: next(stamps))
     assert again[0].t_device_ns < first[-1].t_device_ns - 0.4e9 * start_s
     assert not any((sample.values == 0).all() for sample in again)
     summary = bridge.end()
-    assert summary.old[name] == 4
+    assert summary.old[name] == 6
     assert summary.restarts[name] == 1
 
 

@@ -96,10 +96,10 @@ def test_weights_that_do_not_fit_are_refused_before_they_are_read(
     with pytest.raises(LimitExceededError, match="GB of memory"):
         _load(empty, tmp_path, max_bytes=needed - 1)
     assert empty.proj_out.weight.is_meta
-    monkeypatch.setattr(pretrained_video, "available_memory", lambda: needed - 1)
+    monkeypatch.setattr(pretrained_video.weight_files, "available_memory", lambda: needed - 1)
     with pytest.raises(LimitExceededError, match="GB of memory"):
         _load(empty, tmp_path)
-    monkeypatch.setattr(pretrained_video, "available_memory", lambda: 2 * needed - 1)
+    monkeypatch.setattr(pretrained_video.weight_files, "available_memory", lambda: 2 * needed - 1)
     # Of several processes on this machine each has its part.
     monkeypatch.setenv("LOCAL_WORLD_SIZE", "2")
     with pytest.raises(LimitExceededError, match="GB of memory"):
