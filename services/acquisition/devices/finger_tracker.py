@@ -49,7 +49,8 @@ def keypoints_descriptor(side: Side) -> StreamDescriptor:
 def resolve_nodes(nodes: Sequence[tuple[str, str]]) -> list[int]:
     """Our keypoint index of each (chain, joint), in the device's order, whatever that is.
 
-    Raises PacketError: a node unknown to us, missing, or named twice; the message says which.
+    Raises:
+        PacketError: a node unknown to us, missing, or named twice; the message says which.
     """
     try:
         places = list(node_order(nodes).places)
@@ -65,7 +66,11 @@ def resolve_nodes(nodes: Sequence[tuple[str, str]]) -> list[int]:
 
 
 def parse_node_order(payload: bytes) -> list[int]:
-    """Our keypoint index of each node of a `DXFD` payload; raises as `resolve_nodes`."""
+    """Our keypoint index of each node of a `DXFD` payload, in the device's order.
+
+    Raises:
+        PacketError: a node unknown to us, or not each of the 25 exactly once.
+    """
     chains = {number: name for name, number in CHAIN_IDS.items()}
     joints = {number: name for name, number in JOINT_IDS.items()}
     return resolve_nodes(
@@ -157,7 +162,11 @@ class FingerTracker(base.Driver):
         super().__init__(name, transport=transport, decoder=self._nodes, clock=clock)
 
     def open(self) -> None:
-        """Open and learn the node order; DeviceError: absent, or it does not describe its nodes."""
+        """Open and learn the node order.
+
+        Raises:
+            DeviceError: absent, or it does not describe its nodes.
+        """
         super().open()
         self.transport.write(bytes([base.DESCRIPTOR_REPORT]).ljust(base.REPORT_BYTES, b"\0"))
         for _ in range(DESCRIPTOR_READS):

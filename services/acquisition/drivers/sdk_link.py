@@ -114,7 +114,11 @@ class BridgeHello(FrozenModel):
 
 
 def parse_hello(line: bytes, *, device: str) -> BridgeHello:
-    """The hello of a bridge; raises DeviceError: none, or one of another version."""
+    """The hello of a bridge.
+
+    Raises:
+        DeviceError: no such hello, or one of another version.
+    """
     try:
         hello = BridgeHello.model_validate_json(line)
     except ValidationError as error:
@@ -205,7 +209,11 @@ class BridgeDecoder(StreamDecoder[Packet]):
         self._freshness.reset()
 
     def feed(self, data: bytes, t_host_ns: int = 0) -> list[Sample]:
-        """New samples; raises DeviceError: no hello, as `parse_hello`, or not the wanted device."""
+        """New samples.
+
+        Raises:
+            DeviceError: no hello, another version, or a bridge without the wanted device.
+        """
         if self.hello is None:
             data = self._hear_hello(data)
         return super().feed(data, t_host_ns)
@@ -299,7 +307,11 @@ class BridgeDriver(Driver):
         self._first: Readings = {}
 
     def open(self) -> None:
-        """Connect; raises DeviceError: no link, no hello within 2 s, or not the wanted device."""
+        """Connect and learn who is there.
+
+        Raises:
+            DeviceError: no connection, no hello within 2 s, or another device than requested.
+        """
         super().open()
         for _ in range(HELLO_READS):
             self._first = super().read()
@@ -315,8 +327,9 @@ class BridgeDriver(Driver):
     def read(self) -> Readings:
         """New samples; empty when nothing came.
 
-        Raises StaleDataError: the bridge has sent nothing for 200 ms; DeviceError: it is
-        disconnected or uses another protocol.
+        Raises:
+            StaleDataError: the bridge has sent nothing for 200 ms.
+            DeviceError: the bridge is disconnected or uses another protocol.
         """
         if self._first:
             first, self._first = self._first, {}

@@ -81,9 +81,13 @@ Say = Callable[[str], None]
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """One reading, taken at `t_device_ns` on the source's clock, as the payload of its packet.
+    """One reading of one device, as the payload of its packet.
 
-    `device` tells the clocks of several devices apart; `place` is its number in `SOURCES`.
+    Attributes:
+        device: who read it; the name tells the clocks of several devices apart.
+        place: its place by its number in packets.
+        t_device_ns: when it was taken, on the source's clock.
+        payload: of the packet.
     """
 
     device: str
@@ -112,13 +116,18 @@ class Source(ABC):
     def open(self) -> BridgeHello:
         """Connect to the SDK and say which devices there are.
 
-        Raises DeviceError: it does not run, or a device is not there, which is worth another try;
-        UnavailableError: its library is not installed.
+        Raises:
+            DeviceError: it does not run, or a device is not there; worth another try.
+            UnavailableError: its library is not installed.
         """
 
     @abstractmethod
     def read(self) -> Sequence[Reading]:
-        """New readings; waits some hundredths of a second at most. DeviceError: the SDK is gone."""
+        """New readings; waits for at most some hundredths of a second.
+
+        Raises:
+            DeviceError: the SDK is gone.
+        """
 
     @abstractmethod
     def close(self) -> None:
@@ -134,7 +143,11 @@ class Source(ABC):
 
 
 def import_sdk(module: str, *, install: str) -> ModuleType:
-    """The Python module of an SDK; UnavailableError with `install`, the remedy, without it."""
+    """The Python module of an SDK; `install` says what to do where it is missing.
+
+    Raises:
+        UnavailableError: it, or the shared library that it needs, is not installed.
+    """
     try:
         return import_module(module)
     except (ImportError, OSError, RuntimeError) as error:
@@ -149,7 +162,11 @@ def structure(name: str, **fields: object) -> type[ctypes.Structure]:
 
 
 def load_library(path: str, functions: Functions, *, install: str) -> ctypes.CDLL:
-    """A shared library, by name or path, with typed functions; UnavailableError if it lacks one."""
+    """A shared library, by name or path, with the types of the used functions set.
+
+    Raises:
+        UnavailableError: it is not there, or lacks a function.
+    """
     try:
         library = ctypes.CDLL(path)
         for name, (result, arguments) in functions.items():
@@ -163,7 +180,10 @@ def load_library(path: str, functions: Functions, *, install: str) -> ctypes.CDL
 def hello(**about: object) -> BridgeHello:
     """The first line of the connections of a bridge: `BridgeHello` without the protocol.
 
-    A name of the software that is too long is cut; InvalidInputError for all else beyond limits.
+    A name of the software that is too long is cut.
+
+    Raises:
+        InvalidInputError: something else is outside of its limits, such as a device's name.
     """
     about["software"] = str(about["software"])[:MAX_SOFTWARE]
     fixed = {"protocol": PROTOCOL, "version": PROTOCOL_VERSION, "length_unit": "m"}
@@ -174,7 +194,11 @@ def hello(**about: object) -> BridgeHello:
 
 
 def placed_devices(places: Mapping[str, str]) -> dict[str, BridgedDevice]:
-    """Devices by serial number, from where each sits; InvalidInputError for what is none."""
+    """Devices by their serial numbers, from where each sits.
+
+    Raises:
+        InvalidInputError: a serial number or a place that is none.
+    """
     try:
         return {
             serial: BridgedDevice.model_validate(
@@ -194,10 +218,14 @@ def pose_reading(
     result: int = pose_tracker.TrackingResult.RUNNING_OK,
     is_valid: bool = True,
 ) -> Reading:
-    """A reading of a pose tracker: the twelve numbers of [R | t], row by row.
+    """A reading of a pose tracker.
 
-    They are in the axes and unit of the hello; `result` is OpenVR's, of which stations use
-    RUNNING_OK alone.
+    Args:
+        device: of the hello.
+        t_device_ns: when the pose was taken.
+        numbers: the twelve of [R | t], row by row, in the axes and unit of the hello.
+        result: of the tracking, in OpenVR's numbers; only RUNNING_OK is used by stations.
+        is_valid: what the SDK says of the pose.
     """
     payload = pose_tracker.POSE_PAYLOAD.pack(
         device.index, is_valid, result, t_device_ns / 1e9, *numbers
@@ -211,9 +239,13 @@ def hand_reading(
     points: Float[np.ndarray, "25 3"],
     is_tracked: Bool[np.ndarray, "25"],
 ) -> Reading:
-    """A reading of a finger tracker: nodes in the order of the hello, in axes of the wrist node.
+    """A reading of a finger tracker.
 
-    Those that are not tracked become NaN in a recording.
+    Args:
+        device: of the hello.
+        t_device_ns: when the hand was seen.
+        points: nodes in the order of the hello, relative to the wrist node and in its axes.
+        is_tracked: which of them are measured; all others become NaN in a recording.
     """
     bits = sum(1 << int(node) for node in np.flatnonzero(is_tracked))
     payload = finger_tracker.VALIDITY.pack(bits) + points.astype("<f4").tobytes()
@@ -373,8 +405,10 @@ def _clear_path(path: Path) -> None:
 class BridgeServer:
     """Listens for stations and sends them packets and signs of life.
 
-    The address is a host and port (0: any free one), or the path of a local socket. Raises
-    InvalidInputError: it is in use or not one of this host.
+    The address is a host and port (0: any free one), or the path of a local socket.
+
+    Raises:
+        InvalidInputError: the address is in use or not one of this host.
     """
 
     def __init__(
@@ -524,8 +558,11 @@ def run_bridge(
     """Serve a source until `stop` is set, opening it again whenever it is lost.
 
     It listens as soon as the source was opened once. While the source is away, stations get signs
-    of life and no samples. Address and InvalidInputError are as of `BridgeServer`; `say` shows a
-    line to people. Raises UnavailableError: the SDK's library is not installed.
+    of life and no samples. The address is as of `BridgeServer`; `say` shows a line to people.
+
+    Raises:
+        InvalidInputError: nothing can listen at the address.
+        UnavailableError: the SDK's library is not installed.
     """
     clock = StationClock()
     start_ns = clock.now_ns()

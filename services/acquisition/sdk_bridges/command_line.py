@@ -188,7 +188,11 @@ def _add_choices(parser: argparse.ArgumentParser, source: str) -> None:
 
 
 def build_source(options: argparse.Namespace) -> "Source":
-    """The source that a command line names; InvalidInputError: it names none, or one twice."""
+    """The source that a command line names.
+
+    Raises:
+        InvalidInputError: no device or outlet is named, or a device twice.
+    """
     from dextouch.tactile.layout import SIDES
     from services.acquisition.sdk_bridges import lighthouse_trackers as lighthouse
     from services.acquisition.sdk_bridges import lsl_stream, manus_gloves, openxr_hands

@@ -48,7 +48,8 @@ class LslStream(bridge.Source):
     def open(self) -> BridgeHello:
         """Find the outlet, connect to it, and measure the offset of its clock.
 
-        Raises InvalidInputError: several outlets, or one without numbers.
+        Raises:
+            InvalidInputError: several outlets, or one without numbers.
         """
         lsl = bridge.import_sdk("pylsl", install=INSTALL)
         found = lsl.resolve_byprop(self._by, self._value, minimum=2, timeout=RESOLVE_S)

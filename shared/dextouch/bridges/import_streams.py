@@ -145,10 +145,7 @@ def mapped_form(
 
 
 def _hand_columns(form: Form) -> list[int]:
-    """Where a vector has the joints of both our hands, in the order of `RobotHand`, left first.
-
-    Nothing where it lacks one, as those of other hands.
-    """
+    """Columns of the joints of both our hands, as `RobotHand` orders them; empty for others."""
     names = [name for side in _SIDES for name in RobotHand(side).joint_names]
     is_ours = len(form.shape) == 1 and set(names) <= set(form.names)
     return [form.names.index(name) for name in names] if is_ours else []

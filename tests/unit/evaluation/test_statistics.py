@@ -38,7 +38,7 @@ def test_wilson_solves_its_equation():
 @pytest.mark.parametrize("true_area", [0.75, 0.9, 0.97])
 @pytest.mark.parametrize(("num_successes", "num_failures"), [(5, 15), (12, 12)])
 def test_intervals_of_areas_hold_the_true_one(true_area, num_successes, num_failures):
-    """Of normal scores, whose area follows from their distance; a bootstrap holds 0.58 … 0.94."""
+    """Of normal scores, whose area follows from their distance."""
     draw, distance = np.random.default_rng(0), np.sqrt(2) * norm.ppf(true_area)
     outcome = np.repeat([True, False], [num_successes, num_failures])
     held = 0
