@@ -184,14 +184,17 @@ def live_router(station: Station) -> APIRouter:
 
     @router.get("/poses", response_class=Response, responses={200: {"content": {MSGPACK: {}}}})
     async def get_live_poses(mounted: Annotated[bool, Query()] = True) -> Response:  # noqa: FBT002 - a query's flag
-        """Newest poses and keypoints that are at most 0.5 s old, and the age of each stream's.
+        """Newest poses and keypoints that are at most 0.5 s old, age and delay of each stream's.
 
         Poses are those of the bodies; with `mounted=false` those of the trackers on them.
         """
         now_ns = station.clock.now_ns()
-        ages_s = station.live.ages_s({"pose", "keypoints"}, now_ns)
+        fields = {
+            "age_s": station.live.ages_s({"pose", "keypoints"}, now_ns),
+            "late_s": station.live.late_s({"pose", "keypoints"}),
+        }
         poses = station.live.poses(now_ns, mounted=mounted)
-        return Response(pack({"age_s": ages_s}, poses), media_type=MSGPACK)
+        return Response(pack(fields, poses), media_type=MSGPACK)
 
     @router.get("/cameras")
     async def list_cameras() -> schemas.CameraList:

@@ -12,7 +12,7 @@ from dextouch.errors import DeviceError, NotFoundError, StaleDataError
 from dextouch.geometry import apply, invert, transform_from_pose
 from dextouch.images import encode_jpeg
 from dextouch.schemas import CameraLive, Matrix, SimulatedFault
-from dextouch.streams import H264_UNIT, MOUNTS, Sample, StreamDescriptor, StreamKind
+from dextouch.streams import H264_UNIT, MOUNTS, NO_DEVICE_TIME, Sample, StreamDescriptor, StreamKind
 from services.acquisition.clock import StationClock
 from services.acquisition.drivers.base import Driver, Readings
 from services.acquisition.drivers.images import GroupPreview
@@ -27,6 +27,10 @@ CONNECT_TIMEOUT_S = 10.0
 # Of a quaternion that says where a body points.
 LEAST_NORM = 1e-6
 MAX_AGE_NS = 500_000_000
+# Two clocks part by 30 ms within it at 200 ppm; a queue that stands longer is no longer seen.
+LEAST_DELAY_SPAN_NS = 150_000_000_000
+# Further than packets overtake each other: the device began anew.
+RESTART_NS = 1_000_000_000
 
 
 class Station:
@@ -139,6 +143,46 @@ class Station:
             self.paths.accept(readings)
 
 
+class ArrivalDelay:
+    """How much later than at best a device's newest sample arrived, by the device's own clock.
+
+    The fastest arrival of the last minutes counts as no delay. Samples wait, for example, in the
+    queue of a link that an overloaded computer reads too slowly; their age does not show it.
+    """
+
+    def __init__(self, descriptor: StreamDescriptor) -> None:
+        clock = descriptor.capabilities
+        # A wider counter never wraps.
+        bits = clock.device_time_bits
+        self._wrap_ns = 2**bits * clock.tick_ns if bits <= 62 else None
+        self._last: tuple[int, int] | None = None
+        self._delay_ns = self._least_ns = self._least_before_ns = 0
+        self._since_ns = 0
+
+    @property
+    def late_ns(self) -> int:
+        """Delay of the newest sample."""
+        return self._delay_ns - min(self._least_ns, self._least_before_ns)
+
+    def add(self, sample: Sample) -> None:
+        """Account for a sample; one without a device time changes nothing."""
+        if sample.t_device_ns == NO_DEVICE_TIME:
+            return
+        stamps = (sample.t_host_ns, sample.t_device_ns)
+        (host_ns, device_ns), self._last = self._last or stamps, stamps
+        step_ns = sample.t_device_ns - device_ns
+        if self._wrap_ns is not None:
+            step_ns = (step_ns + self._wrap_ns // 2) % self._wrap_ns - self._wrap_ns // 2
+        if step_ns < -RESTART_NS:
+            self._delay_ns = self._least_ns = self._least_before_ns = 0
+            return
+        self._delay_ns += sample.t_host_ns - host_ns - step_ns
+        if sample.t_host_ns - self._since_ns > LEAST_DELAY_SPAN_NS:
+            self._since_ns = sample.t_host_ns
+            self._least_before_ns, self._least_ns = self._least_ns, self._delay_ns
+        self._least_ns = min(self._least_ns, self._delay_ns)
+
+
 class LiveView:
     """Keeps the newest sample of each stream; nothing is computed until it is requested."""
 
@@ -146,6 +190,11 @@ class LiveView:
         self._descriptors = {d.name: d for driver in drivers for d in driver.descriptors}
         self._newest: dict[str, Sample] = {}
         self._num_images: dict[str, int] = {}
+        self._delays = {
+            name: ArrivalDelay(descriptor)
+            for name, descriptor in self._descriptors.items()
+            if descriptor.capabilities.device_time
+        }
         self._previews = {
             name: GroupPreview((d.shape[0], d.shape[1]))
             for name, d in self._descriptors.items()
@@ -170,6 +219,8 @@ class LiveView:
                 for sample in samples:
                     self._previews[name].add(bytes(sample.values.item()))
             self._newest[name] = samples[-1]
+            if name in self._delays:
+                self._delays[name].add(samples[-1])
             self._num_images[name] = self._num_images.get(name, 0) + len(samples)
 
     def pressures_kpa(self, now_ns: int) -> dict[str, Float32[np.ndarray, " taxels"]]:
@@ -194,6 +245,14 @@ class LiveView:
                 # One may have come since.
                 found[name] = None if newest is None else max(0, now_ns - newest.t_host_ns) / 1e9
         return found
+
+    def late_s(self, kinds: Container[StreamKind]) -> dict[str, float]:
+        """Delay of the newest sample (see `ArrivalDelay`) of streams whose device has a clock."""
+        return {
+            name: delay.late_ns / 1e9
+            for name, delay in self._delays.items()
+            if self._descriptors[name].kind in kinds
+        }
 
     def poses(self, now_ns: int, *, mounted: bool = True) -> dict[str, Float32[np.ndarray, "n m"]]:
         """Newest poses and keypoints by stream, of those heard within the last 0.5 s.
@@ -225,7 +284,7 @@ class LiveView:
 
     def cameras(self, now_ns: int) -> list[CameraLive]:
         """Cameras that have sent an image."""
-        found = []
+        found, late_s = [], self.late_s({"image"})
         for name, descriptor in sorted(self._descriptors.items()):
             sample = self._newest.get(name)
             if descriptor.kind == "image" and sample is not None:
@@ -234,6 +293,7 @@ class LiveView:
                         name=name,
                         image_index=self._num_images[name],
                         age_s=(now_ns - sample.t_host_ns) / 1e9,
+                        late_s=late_s.get(name),
                         height_px=descriptor.shape[0],
                         width_px=descriptor.shape[1],
                     )

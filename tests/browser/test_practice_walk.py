@@ -18,6 +18,8 @@ def guided(page, title):
     row = page.locator("#item_rows tr").filter(has_text=title)
     row.get_by_role("button", name="Guided run").click()
     page.get_by_role("button", name="Begin", exact=True).click()
+    # Until then the hidden panel still has the state of the run before.
+    expect(page.locator("#begin")).to_be_hidden()
     return row
 
 
@@ -27,6 +29,16 @@ def finish(page, row):
     if row is not None:
         expect(row).to_contain_text("good")
     page.get_by_role("button", name="Close").click()
+
+
+def record_until_measured(page):
+    """Shake again as often as the page asks for it: a busy computer delays packets."""
+    for words in ("Record 10 s", *["Record 10 s again"] * 4):
+        page.get_by_role("button", name=words, exact=True).click()
+        expect(page.get_by_role("button", name="Record 10 s")).to_have_count(0)
+        expect(page.locator("#run_state")).not_to_have_text("running", timeout=LONG_MS)
+        if page.locator("#run_state").text_content() != "asking":
+            return
 
 
 def test_a_newcomer_calibrates_the_practice_station(page, tmp_path):
@@ -45,7 +57,7 @@ def test_a_newcomer_calibrates_the_practice_station(page, tmp_path):
         page.get_by_role("button", name="No more pressures").click(timeout=LONG_MS)
         finish(page, zero)
         guided(page, "Path delays")
-        page.get_by_role("button", name="Record 10 s").click()
+        record_until_measured(page)
         finish(page, None)
         for stream in ("wrist left", "wrist right"):
             row = page.locator("#item_rows tr").filter(has_text=f"Latency of {stream}")

@@ -94,6 +94,8 @@ async def test_a_take_over_http(tmp_path):
         trackers = {"head", "wrist_left", "wrist_right", "keypoints_left", "keypoints_right"}
         assert set(fields["age_s"]) == trackers
         assert all(0 <= age_s < 300 for age_s in fields["age_s"].values())
+        assert set(fields["late_s"]) == trackers
+        assert all(late_s >= 0 for late_s in fields["late_s"].values())
         shapes = {"keypoints": (25, 3), "wrist": (4, 4), "head": (4, 4)}
         assert all(arrays[name].shape == shapes[name.split("_")[0]] for name in arrays)
         cameras = (await client.get("/v1/live/cameras")).json()["cameras"]

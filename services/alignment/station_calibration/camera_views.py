@@ -13,7 +13,7 @@ import numpy as np
 from dextouch.clients import HttpLink
 from dextouch.errors import NotFoundError, StaleDataError
 from dextouch.geometry import NUM_DISTORTION
-from dextouch.schemas import StationHealth
+from dextouch.schemas import CameraList, StationHealth
 from dextouch.tactile.layout import Side, TactileLayout
 from services.alignment.calibration.intrinsics import CameraCalibration, calibrate_found
 from services.alignment.calibration.tactile_gain import GloveCalibration, filled_gain
@@ -324,6 +324,13 @@ def live_image(link: HttpLink, camera: str) -> bytes:
         return link.request("GET", path, accept="image/jpeg").body
     except StaleDataError:
         return b""
+
+
+def image_late_s(link: HttpLink, camera: str) -> float:
+    """How much later than at best a camera's newest image arrived; 0 where it has no clock."""
+    reply = link.request("GET", "/v1/live/cameras")
+    cameras = CameraList.model_validate_json(reply.body, extra="ignore").cameras
+    return next((c.late_s for c in cameras if c.name == f"camera_{camera}"), None) or 0.0
 
 
 def coverage_picture(

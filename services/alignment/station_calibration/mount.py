@@ -39,6 +39,7 @@ from services.alignment.station_calibration.boards import (
 from services.alignment.station_calibration.camera_views import (
     LIVE_PERIOD_S,
     MAX_MOTION_PX,
+    image_late_s,
     live_image,
     motion_px,
     read_lens,
@@ -67,6 +68,8 @@ BOARD_FILE: Final = "board.txt"
 MAX_SWAY_RAD, MAX_SWAY_M = float(np.deg2rad(0.3)), 2e-3
 # A place is kept by itself where the camera turned or moved so far from all kept ones (chosen).
 MIN_NEW_TURN_RAD, MIN_NEW_SHIFT_M = float(np.deg2rad(8.0)), 0.05
+# Half the distance of two live images, at both of which the camera has to be still.
+MAX_LATE_S: Final = LIVE_PERIOD_S / 2
 # Chosen: twice what a tracker with twice the expected noise needs.
 MAX_PLACES: Final = 60
 MAX_POSES_BYTES: Final = 1_000_000
@@ -207,11 +210,15 @@ def _with_photos(
 
 
 class Sighting(NamedTuple):
-    """A live image (JPEG; empty if there is none) and, if seen, the tracker's pose around it."""
+    """A live image (JPEG; empty if there is none) and, if seen, the tracker's pose around it.
+
+    `late_s` is how much later than at best the later one of image and pose arrived.
+    """
 
     image: bytes
     T_before: np.ndarray | None
     T_after: np.ndarray | None
+    late_s: float = 0.0
 
 
 def station_sightings(
@@ -224,18 +231,20 @@ def station_sightings(
     wait_for_camera(link, camera, wait=wait)
     last = b""
 
-    def pose() -> np.ndarray | None:
+    def pose() -> tuple[np.ndarray | None, float]:
         reply = link.request("GET", "/v1/live/poses?mounted=false", accept=MSGPACK)
+        fields, found = unpack(reply.body, max_bytes=MAX_POSES_BYTES)
         # The stream of a camera's tracker has the name of the camera.
-        found = unpack(reply.body, max_bytes=MAX_POSES_BYTES)[1].get(camera)
-        return None if found is None else found.astype(np.float64)
+        T, late_s = found.get(camera), fields.get("late_s", {}).get(camera, 0.0)
+        return None if T is None else T.astype(np.float64), late_s
 
     while True:
-        before = pose()
+        before, _ = pose()
         image = live_image(link, camera)
         if image != last or not image:
             last = image
-            yield Sighting(image, before, pose())
+            after, late_s = pose()
+            yield Sighting(image, before, after, max(late_s, image_late_s(link, camera)))
         wait(LIVE_PERIOD_S)
 
 
@@ -339,6 +348,11 @@ class MountSession:
                 "the board is not seen: show all of it, well lit; does the entered board match?",
             ),
             (T is None, "the tracker is not seen"),
+            (
+                sighting.late_s > MAX_LATE_S,
+                f"images or poses arrive {sighting.late_s:.1f} s late, so that they do not belong "
+                "together: the station is overloaded; close other programs, or set it to JPEG",
+            ),
             (not self.is_still, "moving, or blurred: hold still"),
             (
                 is_full,

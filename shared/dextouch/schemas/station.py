@@ -142,11 +142,15 @@ class RecorderStatus(FrozenModel):
 
 
 class CameraLive(FrozenModel):
-    """A camera whose newest image can be had."""
+    """A camera whose newest image can be had.
+
+    `late_s` is how much later than at best it arrived, by the camera's own clock; None without one.
+    """
 
     name: str
     image_index: int
     age_s: float
+    late_s: float | None = None
     height_px: int
     width_px: int
 

@@ -78,6 +78,15 @@ def test_a_place_is_kept_once_when_board_and_tracker_are_still(options, images):
     assert session.progress.num_places == 2
 
 
+def test_an_image_of_another_moment_than_the_pose_is_not_kept(options, images):
+    session = MountSession(options)
+    for _ in range(3):
+        session.add(Sighting(images[0], tracker(1), tracker(1), late_s=0.6))
+        assert "arrive 0.6 s late" in session.hint
+    show(session, images[0], 0)
+    assert session.num_kept == 1
+
+
 def test_what_is_not_seen_is_named(options, images):
     session = MountSession(options)
     blank = cv2.imencode(".png", np.full((360, 480), 128, np.uint8))[1].tobytes()

@@ -208,7 +208,9 @@ def test_station_images_come_once_each_and_pauses_are_no_images():
 
 @pytest.mark.parametrize("of_mount", [False, True])
 def test_a_run_waits_half_a_minute_for_the_first_image_of_a_camera(of_mount):
-    no_pose = SimpleNamespace(body=pack({}, {}))
+    no_pose = SimpleNamespace(body=pack({"late_s": {"head": 0.2}}, {}))
+    size = {"height_px": 4, "width_px": 4, "image_index": 1, "age_s": 0.0}
+    cameras = {"cameras": [size | {"name": "camera_head", "late_s": 0.7}]}
     waited_s, num_late = [], 20
 
     def request(method, path, **options):
@@ -216,6 +218,8 @@ def test_a_run_waits_half_a_minute_for_the_first_image_of_a_camera(of_mount):
             return SimpleNamespace(body=health_of("camera_head"))
         if path.startswith("/v1/live/poses"):
             return no_pose
+        if path == "/v1/live/cameras":
+            return SimpleNamespace(body=json.dumps(cameras).encode())
         if len(waited_s) < num_late:
             raise NotFoundError("camera 'camera_head': not there, or no image yet")
         return SimpleNamespace(body=b"a")
@@ -225,6 +229,7 @@ def test_a_run_waits_half_a_minute_for_the_first_image_of_a_camera(of_mount):
     newest = mount.station_sightings if of_mount else camera.station_arrivals
     first = next(newest(link, "head", wait=waited_s.append))
     assert (first.image if of_mount else first[1]) == b"a"
+    assert not of_mount or first.late_s == 0.7
     assert len(waited_s) == num_late
     num_late = 10_000
     waited_s.clear()
