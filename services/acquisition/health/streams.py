@@ -18,6 +18,7 @@ from dextouch.streams import (
     TRACKERS,
     TURNED_RAD,
     HandTraces,
+    ImplausibleBody,
     Sample,
     StreamDescriptor,
     implausible_bodies,
@@ -311,6 +312,8 @@ class BodiesCheck:
             if mount in calibration
         }
         self._poses: dict[str, deque[tuple[np.ndarray, np.ndarray]]] = {n: deque() for n in BODIES}
+        self._found: ImplausibleBody | None = None
+        self._found_ns = -1
 
     def of(self, name: str) -> Callable[[Evaluation], None]:
         """The check of one stream."""
@@ -331,20 +334,25 @@ class BodiesCheck:
         block = evaluation.block
         if block.values is not None and len(block):
             self._poses[name].append((block.t_host_ns, block.values))
+        # All streams are evaluated in turn.
+        if evaluation.now_ns != self._found_ns:
+            self._found, self._found_ns = self._implausible(evaluation.now_ns), evaluation.now_ns
+        if self._found is not None and self._found.stream == name:
+            evaluation.findings.append(Finding("implausible", "ERROR", self._found.message))
+
+    def _implausible(self, now_ns: int) -> ImplausibleBody | None:
         for blocks in self._poses.values():
-            while blocks and blocks[0][0][-1] < evaluation.now_ns - PLAUSIBLE_NS:
+            while blocks and blocks[0][0][-1] < now_ns - PLAUSIBLE_NS:
                 blocks.popleft()
         if not all(self._poses.values()):
-            return
+            return None
         known = {
             n: [np.concatenate(p) for p in zip(*b, strict=True)] for n, b in self._poses.items()
         }
         grid_ns = known["head"][0][:: max(1, len(known["head"][0]) // MAX_COMPARED)]
         poses = {n: v[nearest_index(t_ns, grid_ns)] for n, (t_ns, v) in known.items()}
         to_body = {n: partial(_mounted, T=T) for n, T in self._mounts.items()}
-        found = implausible_bodies(poses, to_body, of_robot=False)
-        if found is not None and found.stream == name:
-            evaluation.findings.append(Finding("implausible", "ERROR", found.message))
+        return implausible_bodies(poses, to_body, of_robot=False)
 
 
 class HandsCheck:

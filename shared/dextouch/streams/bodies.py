@@ -141,6 +141,7 @@ class _Bodies:
 
     def __init__(self, poses: _Poses, to_body: Mapping[str, ToBody]) -> None:
         self.sent, self._to_body = dict(poses), to_body
+        self._Ts: dict[str, np.ndarray] = {}
 
     def changed(self, change: ToBody, *names: str) -> "_Bodies":
         """Those of these streams read otherwise, by default of all."""
@@ -151,8 +152,10 @@ class _Bodies:
         return _Bodies(self.sent | {one: self.sent[other], other: self.sent[one]}, self._to_body)
 
     def transforms(self, name: str) -> Float64[np.ndarray, "n 4 4"]:
-        poses = self.sent[name]
-        return transform_from_pose(self._to_body.get(name, np.asarray)(poses))
+        if name not in self._Ts:
+            to_body = self._to_body.get(name, np.asarray)
+            self._Ts[name] = transform_from_pose(to_body(self.sent[name]))
+        return self._Ts[name]
 
     def at_m(self, name: str) -> Float64[np.ndarray, "n 3"]:
         return np.asarray(self.transforms(name)[:, :3, 3])
@@ -200,11 +203,12 @@ def _check_commanded(bodies: _Bodies) -> ImplausibleBody | None:
             text = f"stands still while it is commanded over {ways_m[1]:.2f} m"
             text += ": check that it is enabled and reports its pose"
             return ImplausibleBody(name, "frozen", text)
-        turns = [(bodies.changed(_TURNS[one], name).as_commanded(name), one) for one in _TURNS]
-        share, turn = max(turns)
-        shares = bodies.as_commanded(name), share
-        if found := _compared(name, "turned as commanded", shares, turn):
-            return found
+        if (as_read := bodies.as_commanded(name)) <= WRONG_SHARE:
+            share, turn = max(
+                (bodies.changed(_TURNS[one], name).as_commanded(name), one) for one in _TURNS
+            )
+            if found := _compared(name, "turned as commanded", (as_read, share), turn):
+                return found
         off_m = bodies.apart_m(name, name + COMMANDED)
         if off_m > MAX_LAG_M > bodies.apart_m(other, name + COMMANDED):
             text = (
@@ -216,10 +220,12 @@ def _check_commanded(bodies: _Bodies) -> ImplausibleBody | None:
 
 def _check_head(bodies: _Bodies, *, of_robot: bool = False) -> ImplausibleBody | None:
     usual, as_read = "upright and sees the hands", bodies.upright()
+    if as_read > WRONG_SHARE:
+        return None
     # Cameras may stand opposite a robot.
     turns = [_XYZW] if of_robot else list(_TURNS)
     share, turn = max((bodies.changed(_TURNS[one], "head").upright(), one) for one in turns)
-    if of_robot or as_read > WRONG_SHARE:
+    if of_robot:
         return _compared("head", usual, (as_read, share), turn)
     worlds = {one: bodies.changed(change) for one, change in _WORLDS.items()}
     swapped = {one: bodies.exchanged("head", one) for one in WRISTS}
@@ -246,6 +252,8 @@ def _check_wrists(bodies: _Bodies) -> ImplausibleBody | None:
     Conjugates are not tried: a hand that rests turned to the face points forward by them.
     """
     as_read = {name: bodies.forward(name) for name in WRISTS}
+    if min(as_read.values()) > 1 - ALWAYS_SHARE:
+        return None
     read = {name: bodies.changed(_TURNS[_XYZW], name).forward(name) for name in WRISTS}
     if min(max(as_read[name], read[name]) for name in WRISTS) < ALWAYS_SHARE:
         return None
@@ -297,9 +305,9 @@ def _check_sides(bodies: _Bodies) -> ImplausibleBody | None:
 def _compared(
     name: str, usual: str, shares: tuple[float, float], turn: str
 ) -> ImplausibleBody | None:
-    """What is as usual only where quaternions are something else."""
+    """What is not as usual but where quaternions are something else."""
     as_read, otherwise = shares
-    if as_read > WRONG_SHARE or otherwise < RIGHT_SHARE:
+    if otherwise < RIGHT_SHARE:
         return None
     text = (
         f"{usual} in {as_read:.0%} of the samples, but in {otherwise:.0%} of them if its "

@@ -110,7 +110,7 @@ def implausible_repeats(
     if len(equal) < MIN_STEPS or not columns.any():
         return
     held, times = _held(equal)
-    is_rounded = not is_noisy and _are_rounded(rows[~np.append(False, equal)])
+    is_rounded = equal.any() and not is_noisy and _are_rounded(rows[~np.append(False, equal)])
     if is_rounded and (times < MIN_ROUNDED_HELD or abs(times - round(times)) > MAX_UNEVEN):
         # Rounded values of a slow movement come several times, too.
         held, times = held & False, 1.0
@@ -187,12 +187,14 @@ def _looped(rows: np.ndarray, *, is_noisy: bool | None) -> Bool[np.ndarray, " n"
         again &= (rows[lag:] == rows[:-lag]).all(axis=1) & (rows[lag:] != rows[lag - 1 : -1]).any(
             axis=1
         )
-        for start, stop in _runs(again, max(lag, MIN_FROZEN_STEPS)):
+        least = max(lag, MIN_FROZEN_STEPS)
+        if again.sum() < least:
+            continue
+        for start, stop in _runs(again, least):
             found[start + lag : stop + lag] = True
-    others = rows[~found]
-    equal = (others[1:] == others[:-1]).all(axis=1)
     if found.any() and is_noisy is None:
-        is_noisy = _is_noisy(others, equal)
+        others = rows[~found]
+        is_noisy = _is_noisy(others, (others[1:] == others[:-1]).all(axis=1))
     return found if is_noisy else found & False
 
 
@@ -277,6 +279,8 @@ def _frozen(
     frozen, harmless = np.zeros((2, len(rows)), dtype=bool)
     equal = (rows[1:] == rows[:-1]).all(axis=1)
     long = _runs(equal, MIN_FROZEN_STEPS)
+    if not long:
+        return frozen, harmless
     for start, stop in long:
         frozen[start + 1 : stop + 1] = True
     if is_noisy is None:
@@ -294,7 +298,7 @@ def _frozen(
 def _are_rounded(rows: np.ndarray) -> bool:
     """Whether numbers come again in columns, as those of noise hardly do."""
     some = rows[:NOISE_ROWS]
-    num_distinct = np.array([len(np.unique(column)) for column in some.T])
+    num_distinct = 1 + (np.diff(np.sort(some, axis=0), axis=0) != 0).sum(axis=0)
     if not (num_distinct > 1).any():
         return True
     # Of a quarter of the columns: a number near one, as of a small rotation, has few digits left.
