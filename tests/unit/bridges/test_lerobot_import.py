@@ -246,6 +246,25 @@ def test_datasets_of_others_come_in_by_a_mapping(store, other, folder):
     assert len(readers) == 2
 
 
+def test_actions_come_in_our_order_whatever_that_of_the_file(store, other, folder):
+    foreign(store, folder)
+    order = np.random.default_rng(0).permutation(67)
+
+    def names(info):
+        said = info["features"]["action"]
+        said["names"] = {"motors": [said["names"][place] for place in order]}
+
+    def values(rows):
+        rows[:] = [[row[place] for place in order] for row in rows]
+
+    edit_json(folder, INFO, names)
+    edit_column(folder, DATA, "action", values)
+    options = ImportOptions(mapping={"camera_head": "observation.images.top"}, K_head=K_HEAD)
+    (_, second) = import_dataset(folder, other, options=options).ids
+    original = make_episode(seed=4, num_steps=21).values["action_commanded"]
+    np.testing.assert_allclose(other.open(second).read("action").values, original, atol=1e-6)
+
+
 def test_without_a_head_camera_it_is_a_recording_and_the_reason_is_said(store, other, folder):
     foreign(store, folder)
     result = import_dataset(folder, other)

@@ -48,7 +48,13 @@ from dextouch.errors import (
     InvalidInputError,
     UnknownNameError,
 )
-from dextouch.hands.actions import ACTION_DIM, AnchorPoses, poses_from_actions, reanchor
+from dextouch.hands.actions import (
+    ACTION_DIM,
+    AnchorPoses,
+    action_names,
+    poses_from_actions,
+    reanchor,
+)
 from dextouch.schemas import (
     MAX_INSTRUCTION,
     EpisodeAttributes,
@@ -421,7 +427,12 @@ def _columns(
                 f"expected {dtype} {list(shape or ['cameras'])}"
             )
         wanted.append(name)
-    return source.columns(entry, wanted)
+    columns, ours = source.columns(entry, wanted), tuple(action_names())
+    for name in (features[role] for role in ("action", "state") if role in features):
+        names = source.info.features[name].component_names()
+        if names != ours and sorted(names) == sorted(ours):
+            columns[name] = columns[name][:, [names.index(one) for one in ours]]
+    return columns
 
 
 def _actions(
