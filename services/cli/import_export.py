@@ -75,6 +75,7 @@ def _export_lerobot(readers: Iterator[EpisodeReader], options: argparse.Namespac
 
     chosen = ExportOptions(
         fps=options.fps,
+        cameras=options.cameras,
         touch_samples=options.touch_samples,
         license_name=options.license,
         existing="append" if options.append else "replace" if options.force else "refuse",

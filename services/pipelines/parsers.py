@@ -298,6 +298,8 @@ def export_parser() -> argparse.ArgumentParser:
     add("--layout", type=Path, metavar="PATH", help=layout)
     rate = "lerobot: frames per second (default: model rate)"
     add("--fps", type=_whole_fps, metavar="N", help=rate)
+    which = "lerobot: only these, such as camera_head (default: all with colours)"
+    add("--cameras", type=comma_separated, metavar="NAME,…", help=which)
     name = "lerobot: name of the data set (%(default)s)"
     add("--repo-id", default="dextouch/export", metavar="USER/NAME", help=name)
     licence = "lerobot: licence on the data set's card, such as cc-by-4.0"

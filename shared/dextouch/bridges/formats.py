@@ -18,7 +18,9 @@ class FileFormat(NamedTuple):
 
 FORMATS: Final = {
     "lerobot": FileFormat(
-        ("append", "fps", "license", "repo_id", "touch_samples"), ("fps", "k_head"), is_joint=True
+        ("append", "cameras", "fps", "license", "repo_id", "touch_samples"),
+        ("fps", "k_head"),
+        is_joint=True,
     ),
     "mcap": FileFormat(
         ("jpeg_quality", "layout", "touch_images"), ("layout",), signature=b"\x89MCAP0\r\n"

@@ -316,6 +316,18 @@ def test_lerobot_data_sets_grow_and_get_a_card(store, dextouch, tmp_path):
     assert "--append is for format lerobot" in err
 
 
+def test_a_lerobot_data_set_has_the_cameras_that_are_chosen(store, dextouch, tmp_path):
+    write_episode(store, "one", num_steps=5)
+    words = ("export", "--format", "lerobot", "--to", tmp_path / "data", "--cameras")
+    status, _, err = dextouch(*words, "camera_chest")
+    assert status == main.EXIT_REFUSED
+    assert "episode 'one': has no camera ['camera_chest']" in err
+    assert dextouch(*words, "camera_wrist_left")[0] == 0
+    info = json.loads((tmp_path / "data/meta/info.json").read_text())
+    images = [name for name in info["features"] if name.startswith("observation.images.")]
+    assert images == ["observation.images.camera_wrist_left"]
+
+
 def test_a_lerobot_data_set_of_another_robot_becomes_recordings(store, dextouch, tmp_path):
     folder, report = arm().write_v21(tmp_path / "arm"), tmp_path / "report.json"
     words = ("import", folder, "--json", report, "--map", f"camera_head={TOP}")

@@ -477,14 +477,14 @@ def _check_cameras(reader: EpisodeReader, cameras: tuple[str, ...]) -> None:
     if missing:
         raise InvalidInputError(
             f"episode {reader.attributes.episode_id!r}: has no camera {missing}, only {images}; "
-            "choose cameras that all episodes have"
+            "choose some that all episodes have (--cameras)"
         )
     for name in cameras:
         dtype, shape = reader.streams[name].dtype, reader.streams[name].shape
         if not _has_colours(reader.streams[name]):
             raise ShapeError(
                 f"camera {name!r}: got {dtype} {[*shape]}, expected uint8 [h, w, 3] of colours; "
-                "leave it out (`ExportOptions.cameras`), or export the episode as MCAP"
+                "leave it out (--cameras), or export the episode as MCAP"
             )
         height_px, width_px = shape[:2]
         if height_px % 2 or width_px % 2:
