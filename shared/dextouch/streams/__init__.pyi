@@ -11,8 +11,8 @@ from .batch import sample_ends as sample_ends
 from .bodies import BODIES as BODIES
 from .bodies import COMMANDED as COMMANDED
 from .bodies import MOUNTS as MOUNTS
-from .bodies import ToBody as ToBody
 from .bodies import ImplausibleBody as ImplausibleBody
+from .bodies import ToBody as ToBody
 from .bodies import implausible_bodies as implausible_bodies
 from .camera_motion import STILL_SHARE as STILL_SHARE
 from .camera_motion import TRACKERS as TRACKERS
