@@ -42,7 +42,9 @@ def test_turned_and_mirrored_images_are_named(seed, turn, change):
     assert list(faults(seed, change).looks) == [turn]
 
 
-@pytest.mark.parametrize("late_s", [-0.05, 0.1, 0.3])
+@pytest.mark.parametrize(
+    "late_s", [0.1, *(pytest.param(s, marks=pytest.mark.long) for s in (-0.05, 0.3))]
+)
 def test_late_images_do_not_look_turned(late_s):
     assert [dict(faults(seed, late_s=late_s).looks) for seed in range(10)] == [{}] * 10
 

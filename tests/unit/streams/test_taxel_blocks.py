@@ -51,7 +51,9 @@ def found(calibration, counts):
     return taxels | {one.cause: np.flatnonzero(one.samples) for one in repeats}
 
 
-@pytest.mark.parametrize("noise", [0.0, 0.3, 0.6, 3.0])
+@pytest.mark.parametrize(
+    "noise", [0.0, 0.3, *(pytest.param(n, marks=pytest.mark.long) for n in (0.6, 3.0))]
+)
 def test_mock_gloves_with_any_noise_have_no_fault(noise):
     for seed in SEEDS:
         assert found(*take(seed, noise=noise)) == {}
