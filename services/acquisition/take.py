@@ -35,6 +35,7 @@ from services.acquisition.health.cells import count_taxels
 from services.acquisition.health.codes import CODES
 from services.acquisition.health.glove_records import is_ours
 from services.acquisition.health.monitor import HealthMonitor
+from services.acquisition.health.streams import GAP_PERIODS
 from services.acquisition.settings import SpoolSafety
 from services.acquisition.supervisor import StreamCounters
 from services.acquisition.watches import FollowCounts, FollowWatch
@@ -167,9 +168,12 @@ class StreamFacts:
             text = "no sample arrived; is it connected?"
             yield _problem(name, "missing_stream", "ERROR", text)
             return
-        max_gap_s = MAX_GAP_S.get(self.descriptor.kind, MAX_GAP_OTHERS_S)
+        max_gap_s = max(
+            MAX_GAP_S.get(self.descriptor.kind, MAX_GAP_OTHERS_S),
+            GAP_PERIODS / self.descriptor.nominal_rate_hz,
+        )
         if self.largest_gap_s > max_gap_s:
-            text = f"{self.largest_gap_s:.2f} s without a sample, expected at most {max_gap_s} s"
+            text = f"{self.largest_gap_s:.2f} s without a sample, expected at most {max_gap_s:g} s"
             yield _problem(name, "gap", "ERROR", text)
         if self.span_ns[1] - self.span_ns[0] < MIN_JUDGED_S * 1e9:
             return
