@@ -98,11 +98,17 @@ def _turning(
         return "has keypoints in wrist axes, which do not turn with the hand"
     stream = TakeStream(where, descriptor, reader.read(name), reader.attributes.calibration)
     if descriptor.kind == "pose":
-        t_ns, poses = stream.poses()
+        try:
+            t_ns, poses = stream.poses()
+        except InvalidInputError as error:
+            # Of all that is recorded a tracker may be switched off.
+            return f"is not used: {error.message}"
         return turning_of_rotations(t_ns, transform_from_pose(poses)[:, :3, :3])
     t_ns, points_m = stream.timed()
     palm_m = points_m[:, PALM_NODES].astype(np.float64)
     whole = np.isfinite(palm_m).all(axis=(1, 2))
+    if not whole.any():
+        return "has no sample in which the whole palm is seen"
     return turning_of_points(t_ns[whole], palm_m[whole])
 
 
