@@ -90,7 +90,7 @@ class Uploader:
         self._deleted = deleted
         # The last error of each take, and how often in a row the store refused it.
         self._failures: dict[str, tuple[str, int]] = {}
-        # How long the store asked to be left alone, and the take of which it asked this or was away.
+        # How long the store asked to be left alone, and the take at which it did, or was away.
         self._retry_after_s = 0.0
         self._gave_up_at = ""
         self._stopping = threading.Event()
