@@ -54,6 +54,7 @@ IN_THE_CHECK: Final[Mapping[str, tuple[str, ...]]] = {
     "taxels_saturated": ("saturated_taxels",),
 }
 SUSPENDED: Final = "Switch off the suspend mode of this computer and record the take again."
+BROKEN_DISK: Final = "Check the disk of the spool: its cable, whether it is mounted and writable."
 # Gravest first; other codes follow.
 _ORDER: Final = ("missing_stream", "gap", "rate", "loss")
 # Code of the health finding whose advice fits a problem of the check.
@@ -468,7 +469,7 @@ class Take:
     ) -> None:
         self.spool = spool
         self.watch = watch
-        self._failure: str | None = None
+        self._failure: StorageError | None = None
         self._lock = threading.RLock()
         # Of video only what can be looked at without what came before the take: these streams wait
         # for the first image that begins a group.
@@ -528,11 +529,13 @@ class Take:
             try:
                 self.spool.flush()
             except StorageError as error:
-                self._failure = error.message
+                self._failure = error
         check = self.watch.check()
         if self._failure is None:
             return check
-        cause = TakeCause(message=self._failure, advice="Free space on the disk of the spool.")
+        is_full = isinstance(self._failure, StorageFullError)
+        advice = "Free space on the disk of the spool." if is_full else BROKEN_DISK
+        cause = TakeCause(message=self._failure.message, advice=advice)
         return check.model_copy(update={"cause": cause})
 
     def release(self) -> None:
@@ -543,13 +546,13 @@ class Take:
 
     def problems(self) -> tuple[str, ...]:
         """What ended or disturbed the take as a whole."""
-        failure = (self._failure,) if self._failure else ()
+        failure = (self._failure.message,) if self._failure else ()
         return (*failure, *self.watch.host_problems())
 
     def _end(self, error: StorageError | None = None) -> None:
         with self._lock:
             if error is not None and not self.watch.has_ended:
-                self._failure = error.message
+                self._failure = error
                 logger.error("stop_take_by_disk", error=error.message)
             self.watch.end()
             flushes = self._flushes  # Another thread may end it meanwhile.
