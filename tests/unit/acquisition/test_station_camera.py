@@ -1,5 +1,7 @@
 """The driver on a scripted camera and a clock that only the script moves."""
 
+import time
+
 import numpy as np
 import pytest
 from pydantic import ValidationError
@@ -124,6 +126,24 @@ def test_samples_carry_arrival_and_the_drivers_stamp():
     assert descriptor.capabilities.tick_ns == 1000
     assert not descriptor.capabilities.sequence
     assert str(driver.info) == "camera /dev/video7"
+
+
+def test_a_reader_that_was_held_up_between_two_clocks_moves_no_stamp():
+    class HeldUpClock(Clock):
+        num_left = 0
+
+        def read_ns(self, clock_id):
+            now_ns = super().read_ns(clock_id)
+            if clock_id == time.CLOCK_MONOTONIC and self.num_left:
+                self.num_left -= 1
+                self.set_ns(now_ns + 30 * MS)
+            return now_ns
+
+    camera = FakeCamera(image(k) for k in range(2))
+    camera.clock = HeldUpClock()
+    camera.clock.num_left = 1
+    samples = read_all(camera.driver(), camera)
+    assert [s.t_device_ns for s in samples] == [10**9, 10**9 + PERIOD]
 
 
 @pytest.mark.parametrize(("point", "sign"), [("start", 1), ("end", -1)])
