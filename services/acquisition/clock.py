@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import KW_ONLY, dataclass
+from functools import partial
 
 # Far more than the fraction of a millisecond that reading two clocks or slewing one takes.
 MIN_NOTICED_NS = 100_000_000
@@ -50,11 +51,8 @@ class StationClock:
 
     def wall_offset_ns(self) -> int:
         """Wall clock minus the time since boot; a jump means that the wall clock was set."""
-        readings = []
-        for _ in range(CLOCK_READS):
-            begin_ns, wall_ns = self.read_ns(time.CLOCK_BOOTTIME), self.read_ns(time.CLOCK_REALTIME)
-            readings.append((self.read_ns(time.CLOCK_BOOTTIME) - begin_ns, wall_ns - begin_ns))
-        return min(readings)[1]
+        clocks = (time.CLOCK_REALTIME, time.CLOCK_BOOTTIME)
+        return _difference_ns(*(partial(self.read_ns, clock_id) for clock_id in clocks))
 
     def _boot_over_monotonic_ns(self) -> int:
         return self.read_ns(time.CLOCK_BOOTTIME) - self.read_ns(time.CLOCK_MONOTONIC)
@@ -207,19 +205,24 @@ def station_offset_ns(clock: StationClock) -> int:
 
     NTP slews CLOCK_MONOTONIC against the station's clock, by 500 ppm (the kernel) or more (chrony),
     so it is read anew for every few stamps: for one of a tenth of a second ago 500 ppm are 50 µs.
+    """
+    return -_difference_ns(partial(clock.read_ns, time.CLOCK_MONOTONIC), clock.now_ns)
+
+
+def _difference_ns(first: Callable[[], int], second: Callable[[], int]) -> int:
+    """The first clock minus the second at one moment.
+
     A reading that was interrupted is repeated; what remains is below half of READ_GAP_NS.
     """
-    gap_ns, offset_ns = sys.maxsize, 0
+    gap_ns, difference_ns = sys.maxsize, 0
     for _ in range(CLOCK_READS):
-        before_ns = clock.now_ns()
-        monotonic_ns = clock.read_ns(time.CLOCK_MONOTONIC)
-        after_ns = clock.now_ns()
+        before_ns, first_ns, after_ns = second(), first(), second()
         if after_ns - before_ns < gap_ns:
             gap_ns = after_ns - before_ns
-            offset_ns = (before_ns + after_ns) // 2 - monotonic_ns
+            difference_ns = first_ns - (before_ns + after_ns) // 2
         if gap_ns <= READ_GAP_NS:
             break
-    return offset_ns
+    return difference_ns
 
 
 class HostWatch:

@@ -34,8 +34,7 @@ from services.acquisition.health.causes import SIMULATED_ADVICE
 from services.acquisition.health.cells import count_taxels
 from services.acquisition.health.codes import CODES
 from services.acquisition.health.glove_records import is_ours
-from services.acquisition.health.monitor import HealthMonitor
-from services.acquisition.health.streams import GAP_PERIODS
+from services.acquisition.health.monitor import HealthMonitor, longest_gap_ns
 from services.acquisition.settings import SpoolSafety
 from services.acquisition.supervisor import StreamCounters
 from services.acquisition.watches import FollowCounts, FollowWatch
@@ -68,8 +67,6 @@ _ADVICE: Final = {
 LOSS_ERROR = 0.05
 # Shorter takes say nothing about rates and loss ratios.
 MIN_JUDGED_S = 1.0
-MAX_GAP_S = {"image": 0.5}
-MAX_GAP_OTHERS_S = 0.2
 # What stands in the take's quality in a form of its own (`_rate_hz`), or counts from the
 # station's start.
 OTHER_FIGURES = {"rate_hz", "clock_offset_seconds", "clock_resets"}
@@ -169,10 +166,7 @@ class StreamFacts:
             text = "no sample arrived; is it connected?"
             yield _problem(name, "missing_stream", "ERROR", text)
             return
-        max_gap_s = max(
-            MAX_GAP_S.get(self.descriptor.kind, MAX_GAP_OTHERS_S),
-            GAP_PERIODS / self.descriptor.nominal_rate_hz,
-        )
+        max_gap_s = longest_gap_ns(self.descriptor) / 1e9
         if self.largest_gap_s > max_gap_s:
             text = f"{self.largest_gap_s:.2f} s without a sample, expected at most {max_gap_s:g} s"
             yield _problem(name, "gap", "ERROR", text)
