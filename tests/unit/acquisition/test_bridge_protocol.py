@@ -274,9 +274,7 @@ def test_a_clock_that_is_set_back_or_leapt_ahead_once_costs_a_moment(num_ahead, 
     gate = FreshnessGate()
     feed_gate(gate, [1.0] * num_ahead, step_ns=round(ahead_ms * MS))
     later = range(num_ahead, num_ahead + 200)
-    admitted = [
-        gate.admits(5 * 10**12 + 10 * k * MS, 10**9 + (10 * k + 1) * MS) for k in later
-    ]
+    admitted = [gate.admits(5 * 10**12 + 10 * k * MS, 10**9 + (10 * k + 1) * MS) for k in later]
     assert not admitted[0]
     assert all(admitted[25:])
 
