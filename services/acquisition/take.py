@@ -170,7 +170,7 @@ class StreamFacts:
         if self.largest_gap_s > max_gap_s:
             text = f"{self.largest_gap_s:.2f} s without a sample, expected at most {max_gap_s:g} s"
             yield _problem(name, "gap", "ERROR", text)
-        if self.span_ns[1] - self.span_ns[0] < MIN_JUDGED_S * 1e9:
+        if self.span_ns[1] - self.span_ns[0] < max(MIN_JUDGED_S, max_gap_s) * 1e9:
             return
         rate_hz, nominal_hz = self.rate_hz or 0.0, self.descriptor.nominal_rate_hz
         off = abs(rate_hz / nominal_hz - 1.0)
