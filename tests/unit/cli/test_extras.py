@@ -94,7 +94,7 @@ def test_services_of_the_light_image_need_no_more_than_its_extras():
     absent = [package for package, extra in EXTRA_OF.items() if extra not in installed]
     assert {"torch", "pyarrow"} <= set(absent)
     folders = ("acquisition", "alignment", "dashboard", "episode_store", "evaluation.studies")
-    apps = [f"services.{folder}.app" for folder in folders]
+    apps = [*(f"services.{folder}.app" for folder in folders), "services.twin.world"]
     code = f"{WITHOUT}import {', '.join(apps)}"
     done = subprocess.run(
         [sys.executable, "-c", code, *absent], cwd=ROOT, capture_output=True, text=True, check=False
