@@ -27,8 +27,9 @@ CONNECT_TIMEOUT_S = 10.0
 # Of a quaternion that says where a body points.
 LEAST_NORM = 1e-6
 MAX_AGE_NS = 500_000_000
-# Two clocks part by 30 ms within it at 200 ppm; a queue that stands longer is no longer seen.
-LEAST_DELAY_SPAN_NS = 150_000_000_000
+# Chosen: clocks part by 60 ms within twice of it at 500 ppm, which is no delay; a queue that stands
+# for longer, without growing, is no longer seen.
+LEAST_DELAY_SPAN_NS = 60_000_000_000
 # Further than packets overtake each other: the device began anew.
 RESTART_NS = 1_000_000_000
 
