@@ -156,6 +156,8 @@ class ArrivalDelay:
         # A wider counter never wraps.
         bits = clock.device_time_bits
         self._wrap_ns = 2**bits * clock.tick_ns if bits <= 62 else None
+        # After a longer pause clocks may have parted, or the counter wrapped.
+        self._pause_ns = min(LEAST_DELAY_SPAN_NS, (self._wrap_ns or 2**62) // 2)
         self._last: tuple[int, int] | None = None
         self._delay_ns = self._least_ns = self._least_before_ns = 0
         self._since_ns = 0
@@ -174,7 +176,7 @@ class ArrivalDelay:
         step_ns = sample.t_device_ns - device_ns
         if self._wrap_ns is not None:
             step_ns = (step_ns + self._wrap_ns // 2) % self._wrap_ns - self._wrap_ns // 2
-        if step_ns < -RESTART_NS:
+        if step_ns < -RESTART_NS or sample.t_host_ns - host_ns > self._pause_ns:
             self._delay_ns = self._least_ns = self._least_before_ns = 0
             return
         self._delay_ns += sample.t_host_ns - host_ns - step_ns

@@ -124,7 +124,6 @@ class TrainingPlan(_Weights):
 
 
 PlanT = TypeVar("PlanT")
-MadeT = TypeVar("MadeT")
 
 
 class PeakMemory(TorchDispatchMode):  # type: ignore[no-untyped-call]
@@ -488,10 +487,11 @@ def _work(model: JointWorldModel, num_steps: int) -> tuple[tuple[Work, ...], int
     def step() -> JointLatents:
         return model.denoise(context, noisy, torch.ones(1))
 
-    shared, context = _measured(("what sampler steps share", 1), share, model)
+    context = share()
     kept = {str(id(tensor)): tensor for tensor in _tensors_of(context)}
+    shared = _measured(("what sampler steps share", 1), share, model, kept.values())
     steps = ("one sampler step", config.sampling_steps)
-    sampled, _ = _measured(steps, step, model, kept.values())
+    sampled = _measured(steps, step, model, kept.values())
     encoded, *decoded = _codec_work(_of_codec(config), num_steps)
     return (encoded, shared, sampled, *decoded), memory_of(kept)
 
@@ -506,19 +506,19 @@ def _codec_work(config: NetworkConfig, num_steps: int) -> tuple[Work, ...]:
         _DECODING[0]: lambda: model.decode(first, noisy),
         _DECODING[1]: lambda: model.decode(first, noisy, all_images=False),
     }
-    return tuple(_measured((name, 1), run, model)[0] for name, run in jobs.items())
+    return tuple(_measured((name, 1), run, model) for name, run in jobs.items())
 
 
 def _measured(
     times: tuple[str, int],
-    run: Callable[[], MadeT],
+    run: Callable[[], object],
     model: JointWorldModel,
     kept: Iterable[Tensor] = (),
-) -> tuple[Work, MadeT]:
-    """A computation that has a name and is done some times, and its result."""
+) -> Work:
+    """A computation that has a name and is done some times, beside what is kept."""
     with PeakMemory((*model.parameters(), *model.buffers(), *kept)) as memory:
-        result = run()
-    return Work(*times, memory.flops, memory.peak_bytes), result
+        run()
+    return Work(*times, memory.flops, memory.peak_bytes)
 
 
 def _tensors_of(kept: object) -> list[Tensor]:

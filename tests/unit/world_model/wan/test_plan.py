@@ -16,6 +16,8 @@ from services.world_model.network.model import JointWorldModel
 from services.world_model.paper_settings import LoraSettings, TrainCommand
 from services.world_model.plan import (
     PeakMemory,
+    _inputs,
+    _latents,
     _pass,
     _plan_of,
     plan_of,
@@ -126,6 +128,21 @@ def test_a_plan_without_weights_is_what_a_run_measures(
             else:
                 # Convolutions of processors take working memory beside their tensors.
                 assert 0.2 * measured < planned[name].memory_bytes < 1.1 * measured, name
+
+
+def test_inputs_are_no_memory_of_what_sampler_steps_share():
+    config = NetworkConfig(num_layers=1)
+    with torch.device("meta"), torch.no_grad():
+        model = JointWorldModel(config).eval()
+        inputs, (first, noisy) = (
+            _inputs(config, config.max_steps),
+            _latents(model, config.max_steps),
+        )
+        with PeakMemory((*model.parameters(), *model.buffers())) as memory:
+            model.clean_tokens(model.context(inputs, first), noisy)
+    shared = next(work for work in plan_of(config).work if "share" in work.name)
+    # The context holds the raster as it came.
+    assert shared.memory_bytes <= memory.peak_bytes - inputs.raster.nbytes
 
 
 def _resized(request, px):
