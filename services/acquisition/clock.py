@@ -1,13 +1,19 @@
 """Clock of a station, which timestamps arrivals and on which all threads wait."""
 
+import sys
 import threading
 import time
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import KW_ONLY, dataclass
+from functools import partial
 
 # Far more than the fraction of a millisecond that reading two clocks or slewing one takes.
 MIN_NOTICED_NS = 100_000_000
+# Two clocks are read together in a few µs; where it took longer, the process was interrupted.
+# Chosen: ten attempts, since even a busy machine interrupts fewer than one of two.
+READ_GAP_NS = 20_000
+CLOCK_READS = 10
 
 
 class StationClock:
@@ -45,7 +51,8 @@ class StationClock:
 
     def wall_offset_ns(self) -> int:
         """Wall clock minus the time since boot; a jump means that the wall clock was set."""
-        return self.read_ns(time.CLOCK_REALTIME) - self.read_ns(time.CLOCK_BOOTTIME)
+        clocks = (time.CLOCK_REALTIME, time.CLOCK_BOOTTIME)
+        return _difference_ns(*(partial(self.read_ns, clock_id) for clock_id in clocks))
 
     def _boot_over_monotonic_ns(self) -> int:
         return self.read_ns(time.CLOCK_BOOTTIME) - self.read_ns(time.CLOCK_MONOTONIC)
@@ -191,6 +198,31 @@ class PeriodicCall:
                     now_ns = self.clock.now_ns()
                     self.on_wake(now_ns, now_ns - due_ns)
                 self.call()
+
+
+def station_offset_ns(clock: StationClock) -> int:
+    """What a recent stamp on CLOCK_MONOTONIC of this host needs to be on the station's clock.
+
+    NTP slews CLOCK_MONOTONIC against the station's clock, by 500 ppm (the kernel) or more (chrony),
+    so it is read anew for every few stamps: for one of a tenth of a second ago 500 ppm are 50 µs.
+    """
+    return -_difference_ns(partial(clock.read_ns, time.CLOCK_MONOTONIC), clock.now_ns)
+
+
+def _difference_ns(first: Callable[[], int], second: Callable[[], int]) -> int:
+    """The first clock minus the second at one moment.
+
+    A reading that was interrupted is repeated; what remains is below half of READ_GAP_NS.
+    """
+    gap_ns, difference_ns = sys.maxsize, 0
+    for _ in range(CLOCK_READS):
+        before_ns, first_ns, after_ns = second(), first(), second()
+        if after_ns - before_ns < gap_ns:
+            gap_ns = after_ns - before_ns
+            difference_ns = first_ns - (before_ns + after_ns) // 2
+        if gap_ns <= READ_GAP_NS:
+            break
+    return difference_ns
 
 
 class HostWatch:

@@ -27,8 +27,9 @@ CONNECT_TIMEOUT_S = 10.0
 # Of a quaternion that says where a body points.
 LEAST_NORM = 1e-6
 MAX_AGE_NS = 500_000_000
-# Two clocks part by 30 ms within it at 200 ppm; a queue that stands longer is no longer seen.
-LEAST_DELAY_SPAN_NS = 150_000_000_000
+# Chosen: clocks part by 60 ms within twice of it at 500 ppm, which is no delay; a queue that stands
+# for longer, without growing, is no longer seen.
+LEAST_DELAY_SPAN_NS = 60_000_000_000
 # Further than packets overtake each other: the device began anew.
 RESTART_NS = 1_000_000_000
 
@@ -155,6 +156,8 @@ class ArrivalDelay:
         # A wider counter never wraps.
         bits = clock.device_time_bits
         self._wrap_ns = 2**bits * clock.tick_ns if bits <= 62 else None
+        # After a longer pause clocks may have parted, or the counter wrapped.
+        self._pause_ns = min(LEAST_DELAY_SPAN_NS, (self._wrap_ns or 2**62) // 2)
         self._last: tuple[int, int] | None = None
         self._delay_ns = self._least_ns = self._least_before_ns = 0
         self._since_ns = 0
@@ -173,7 +176,7 @@ class ArrivalDelay:
         step_ns = sample.t_device_ns - device_ns
         if self._wrap_ns is not None:
             step_ns = (step_ns + self._wrap_ns // 2) % self._wrap_ns - self._wrap_ns // 2
-        if step_ns < -RESTART_NS:
+        if step_ns < -RESTART_NS or sample.t_host_ns - host_ns > self._pause_ns:
             self._delay_ns = self._least_ns = self._least_before_ns = 0
             return
         self._delay_ns += sample.t_host_ns - host_ns - step_ns

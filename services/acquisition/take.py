@@ -34,7 +34,7 @@ from services.acquisition.health.causes import SIMULATED_ADVICE
 from services.acquisition.health.cells import count_taxels
 from services.acquisition.health.codes import CODES
 from services.acquisition.health.glove_records import is_ours
-from services.acquisition.health.monitor import HealthMonitor
+from services.acquisition.health.monitor import HealthMonitor, longest_gap_ns
 from services.acquisition.settings import SpoolSafety
 from services.acquisition.supervisor import StreamCounters
 from services.acquisition.watches import FollowCounts, FollowWatch
@@ -53,6 +53,7 @@ IN_THE_CHECK: Final[Mapping[str, tuple[str, ...]]] = {
     "taxels_saturated": ("saturated_taxels",),
 }
 SUSPENDED: Final = "Switch off the suspend mode of this computer and record the take again."
+BROKEN_DISK: Final = "Check the disk of the spool: its cable, whether it is mounted and writable."
 # Gravest first; other codes follow.
 _ORDER: Final = ("missing_stream", "gap", "rate", "loss")
 # Code of the health finding whose advice fits a problem of the check.
@@ -66,8 +67,6 @@ _ADVICE: Final = {
 LOSS_ERROR = 0.05
 # Shorter takes say nothing about rates and loss ratios.
 MIN_JUDGED_S = 1.0
-MAX_GAP_S = {"image": 0.5}
-MAX_GAP_OTHERS_S = 0.2
 # What stands in the take's quality in a form of its own (`_rate_hz`), or counts from the
 # station's start.
 OTHER_FIGURES = {"rate_hz", "clock_offset_seconds", "clock_resets"}
@@ -167,11 +166,11 @@ class StreamFacts:
             text = "no sample arrived; is it connected?"
             yield _problem(name, "missing_stream", "ERROR", text)
             return
-        max_gap_s = MAX_GAP_S.get(self.descriptor.kind, MAX_GAP_OTHERS_S)
+        max_gap_s = longest_gap_ns(self.descriptor) / 1e9
         if self.largest_gap_s > max_gap_s:
-            text = f"{self.largest_gap_s:.2f} s without a sample, expected at most {max_gap_s} s"
+            text = f"{self.largest_gap_s:.2f} s without a sample, expected at most {max_gap_s:g} s"
             yield _problem(name, "gap", "ERROR", text)
-        if self.span_ns[1] - self.span_ns[0] < MIN_JUDGED_S * 1e9:
+        if self.span_ns[1] - self.span_ns[0] < max(MIN_JUDGED_S, max_gap_s) * 1e9:
             return
         rate_hz, nominal_hz = self.rate_hz or 0.0, self.descriptor.nominal_rate_hz
         off = abs(rate_hz / nominal_hz - 1.0)
@@ -464,7 +463,7 @@ class Take:
     ) -> None:
         self.spool = spool
         self.watch = watch
-        self._failure: str | None = None
+        self._failure: StorageError | None = None
         self._lock = threading.RLock()
         # Of video only what can be looked at without what came before the take: these streams wait
         # for the first image that begins a group.
@@ -524,11 +523,13 @@ class Take:
             try:
                 self.spool.flush()
             except StorageError as error:
-                self._failure = error.message
+                self._failure = error
         check = self.watch.check()
         if self._failure is None:
             return check
-        cause = TakeCause(message=self._failure, advice="Free space on the disk of the spool.")
+        is_full = isinstance(self._failure, StorageFullError)
+        advice = "Free space on the disk of the spool." if is_full else BROKEN_DISK
+        cause = TakeCause(message=self._failure.message, advice=advice)
         return check.model_copy(update={"cause": cause})
 
     def release(self) -> None:
@@ -539,13 +540,13 @@ class Take:
 
     def problems(self) -> tuple[str, ...]:
         """What ended or disturbed the take as a whole."""
-        failure = (self._failure,) if self._failure else ()
+        failure = (self._failure.message,) if self._failure else ()
         return (*failure, *self.watch.host_problems())
 
     def _end(self, error: StorageError | None = None) -> None:
         with self._lock:
             if error is not None and not self.watch.has_ended:
-                self._failure = error.message
+                self._failure = error
                 logger.error("stop_take_by_disk", error=error.message)
             self.watch.end()
             flushes = self._flushes  # Another thread may end it meanwhile.

@@ -90,8 +90,9 @@ class Uploader:
         self._deleted = deleted
         # The last error of each take, and how often in a row the store refused it.
         self._failures: dict[str, tuple[str, int]] = {}
-        # How long the store asked to be left alone.
+        # How long the store asked to be left alone, and the take at which it did, or was away.
         self._retry_after_s = 0.0
+        self._gave_up_at = ""
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="upload", daemon=True)
 
@@ -168,12 +169,16 @@ class Uploader:
         """Send every closed take that the store lacks; ids of those that it has now.
 
         A take that cannot be sent is reported by `status` and tried again at the next call, unless
-        the store refused it for good. A store that is busy or full says when to come again, and is
-        asked for nothing else before.
+        the store refused it for good. A store that is away, busy or full is asked for nothing else
+        in this call: reading the logs of all takes for nothing would hold up what is recorded. The
+        next call begins with the take after that one. A busy or full one says when to come again.
         """
         done = []
         self._retry_after_s = 0.0
-        for path in spooled_takes(self._spool_root):
+        waiting = spooled_takes(self._spool_root)
+        waiting.sort(key=lambda path: (path.name <= self._gave_up_at, path))
+        self._gave_up_at = ""
+        for path in waiting:
             if self._stopping.is_set():
                 break
             try:
@@ -188,9 +193,10 @@ class Uploader:
                 if self._is_removed_as_deleted(path, error):
                     continue
                 self._note_failure(path, error)
-                if "retry_after_s" in error.details:
-                    asked_s = float(str(error.details["retry_after_s"]))
+                if isinstance(error, UnavailableError) or "retry_after_s" in error.details:
+                    asked_s = float(str(error.details.get("retry_after_s", 0.0)))
                     self._retry_after_s = min(asked_s, MAX_RETRY_AFTER_S)
+                    self._gave_up_at = path.name
                     break
             except Exception as error:
                 # A mistake of ours with one take must not keep all others here.

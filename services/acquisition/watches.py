@@ -92,8 +92,9 @@ class _StreamPath:
     def accept(self, samples: Sequence[Sample]) -> None:
         self._queue.extend((sample.t_host_ns, sample.t_device_ns) for sample in samples)
 
-    def follow(self) -> None:
-        """Estimate the times of the samples since the last call."""
+    def follow(self) -> bool:
+        """Estimate times of the samples since the last call; whether the device's clock stepped."""
+        has_stepped = False
         if self._queue:
             # Samples of uncertain time show no delay.
             self._newest = None
@@ -104,12 +105,15 @@ class _StreamPath:
             except InvalidInputError:
                 # The device left its stamp out; health says so.
                 self._restart()
+                has_stepped = True
                 continue
             if self._clock.uncertainty_ns == 0.0:
                 self._newest = (t_device_ns, estimate_ns)
             self._num_samples += 1
             if self._clock.num_steps > self._num_steps:
                 self._num_steps, self._num_samples = self._clock.num_steps, 0
+                has_stepped = True
+        return has_stepped
 
     def latency(self, trips: RoundTripClock) -> PathLatency | None:
         """The stream's path delay; None while too little is known."""
@@ -141,8 +145,8 @@ class _DevicePath:
         self.num_failures = 0
         self._supervisor = supervisor
         self._driver = driver
-        ticks_ns = [descriptor.capabilities.tick_ns for descriptor in stamped]
-        self._trips = RoundTripClock(resolution_ns=max(ticks_ns, default=1))
+        self._resolution_ns = max((one.capabilities.tick_ns for one in stamped), default=1)
+        self._trips = RoundTripClock(resolution_ns=self._resolution_ns)
         self._num_silent = 0
         self._rounds_to_skip = 0
 
@@ -166,7 +170,9 @@ class _DevicePath:
     def latencies(self) -> dict[str, PathLatency]:
         found = {}
         for stream in self.streams:
-            stream.follow()
+            if stream.follow():
+                # A restarted device that does not answer yet: its answers are of the clock before.
+                self._trips = RoundTripClock(resolution_ns=self._resolution_ns)
             if self._trips.num_exchanges >= MIN_EXCHANGES:
                 latency = stream.latency(self._trips)
                 if latency is not None:

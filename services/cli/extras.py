@@ -8,9 +8,9 @@ _PACKAGES = {
     "store": "zarr zstandard google_crc32c av structlog",
     "station": "serial fastcrc hid hidraw usb cv2",
     "serve": "fastapi uvicorn uvloop httptools rich redis httpx pydantic_settings "
-    "prometheus_client jinja2 markdown_it websockets shtab",
+    "prometheus_client jinja2 markdown_it PIL websockets shtab",
     "align": "scipy numba",
-    "model": "torch safetensors PIL",
+    "model": "torch safetensors",
     "full": "diffusers transformers",
     "twin": "mujoco",
     "gym": "gymnasium",

@@ -179,24 +179,19 @@ def figures_of_draws(draws: ScoreDraws) -> dict[str, Float64[np.ndarray, " draws
 
 
 def _figures_of_part(real: np.ndarray, imagined: np.ndarray) -> dict[str, np.ndarray]:
-    ranks = [_mean_ranks(side) for side in (real, imagined)]
     orders = [np.sign(side[:, :, None] - side[:, None, :]) for side in (real, imagined)]
     gap = np.abs(real[:, :, None] - real[:, None, :])
     opposite = orders[0] * orders[1] < 0
     return {
         "pearson": pearson_of_draws(real, imagined),
-        "spearman": pearson_of_draws(*ranks),
+        # Twice the mean ranks, but for a constant.
+        "spearman": pearson_of_draws(*(order.sum(axis=2) for order in orders)),
         "kendall": pearson_of_draws(*(order.reshape(len(order), -1) for order in orders)),
         "mmrv": mmrv_of_draws(real, imagined),
         "mmrv_paper": np.asarray((gap * opposite).max(axis=2).mean(axis=1)),
         "bias": np.asarray((imagined - real).mean(axis=1)),
         "mean_absolute_error": np.asarray(np.abs(imagined - real).mean(axis=1)),
     }
-
-
-def _mean_ranks(scores: np.ndarray) -> Float64[np.ndarray, "draws policies"]:
-    order = np.sign(scores[:, :, None] - scores[:, None, :])
-    return np.asarray((order > 0).sum(axis=2) + (order == 0).sum(axis=2) / 2)
 
 
 def chance_of_correlation(
@@ -266,18 +261,20 @@ def paired_differences(
 def sign_flip_p(differences: np.ndarray, generator: np.random.Generator) -> float:
     """Two-sided p value of a mean of paired differences [n] under random signs.
 
-    Exact where at most `MAX_PERMUTATIONS` sign patterns of the nonzero differences exist; 1 where
-    all are zero.
+    Differences of one size count together: success rates have few sizes. Exact where their sums
+    are at most `MAX_PERMUTATIONS`, as of all outcomes without repeats; 1 where all are zero.
     """
-    nonzero = differences[differences != 0]
-    if len(nonzero) == 0:
-        return 1.0
-    if 2 ** len(nonzero) <= MAX_PERMUTATIONS:
-        signs = np.array(list(itertools.product((1.0, -1.0), repeat=len(nonzero))))
-        counted = 0
-    else:
-        signs = generator.choice([1.0, -1.0], (MAX_PERMUTATIONS, len(nonzero)))
-        counted = 1
-    sums = np.abs(signs @ nonzero)
-    as_large = int(np.count_nonzero(sums >= abs(nonzero.sum()) - 1e-9))
-    return (as_large + counted) / (len(signs) + counted)
+    # Shares of repeats that are equal may differ by rounding.
+    rounded = np.round(differences, 12)
+    sizes, counts = np.unique(np.abs(rounded[rounded != 0]), return_counts=True)
+    least = abs(rounded.sum()) - 1e-9
+    if math.prod((counts + 1).tolist()) > MAX_PERMUTATIONS:
+        drawn = 2 * generator.binomial(counts, 0.5, (MAX_PERMUTATIONS, len(counts))) - counts
+        as_large = int(np.count_nonzero(np.abs(drawn @ sizes) >= least))
+        return (as_large + 1) / (MAX_PERMUTATIONS + 1)
+    sums, chances = np.zeros(1), np.ones(1)
+    for size, count in zip(sizes, counts.tolist(), strict=True):
+        sums = np.add.outer(sums, size * np.arange(-count, count + 1, 2)).ravel()
+        ways = [math.comb(count, positive) / 2**count for positive in range(count + 1)]
+        chances = np.multiply.outer(chances, ways).ravel()
+    return min(1.0, float(chances[np.abs(sums) >= least].sum()))

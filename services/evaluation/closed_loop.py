@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float64
@@ -43,7 +44,10 @@ from services.evaluation.progress import Progress
 from services.evaluation.rating.rubrics import Rubric, read_rubrics
 from services.evaluation.reporting.pictures import PredictionPicture
 from services.evaluation.scores import REAL, ClosedLoopReport, Outcome, RolloutFailure, RolloutScore
-from services.evaluation.success_classifier import SuccessClassifier
+
+if TYPE_CHECKING:
+    # Brings torch, which readers of results need not have.
+    from services.evaluation.success_classifier import SuccessClassifier
 
 # Repeats of an imagined rollout differ by this in the seed of their noise.
 _REPEAT_STRIDE = 2**40
@@ -71,7 +75,7 @@ def evaluate(
     imagined: Mapping[str, WorldAddress],
     policies: Mapping[str, Policy],
     plan: EvaluationPlan,
-    probe: SuccessClassifier,
+    probe: "SuccessClassifier",
     keep: Callable[[Outcome], None] | None = None,
 ) -> ClosedLoopReport:
     """Roll out every policy from every start in every world, by their names in the report.
@@ -110,7 +114,7 @@ def evaluate(
 
 
 def begin_matched(
-    real: WorldAddress, plan: EvaluationPlan, probe: SuccessClassifier
+    real: WorldAddress, plan: EvaluationPlan, probe: "SuccessClassifier"
 ) -> list[MatchedStart | FailedStart]:
     """Start every task and seed once in the real world.
 
@@ -160,10 +164,10 @@ class RolloutRunner:
     """
 
     worlds: StudyWorlds
-    probe: SuccessClassifier
+    probe: "SuccessClassifier"
     num_steps: int
     shows_all: bool = False
-    own_probes: Mapping[str, SuccessClassifier] = field(default_factory=dict)
+    own_probes: Mapping[str, "SuccessClassifier"] = field(default_factory=dict)
     rubrics: Mapping[str, Rubric] = field(default_factory=read_rubrics)
 
     def run(
@@ -316,7 +320,7 @@ def film(
     imagined: Mapping[str, WorldAddress],
     policies: Mapping[str, Policy],
     plan: EvaluationPlan,
-    probe: SuccessClassifier,
+    probe: "SuccessClassifier",
 ) -> tuple[PredictionPicture, ...]:
     """Play the example pair of every task again, with the images of all steps.
 

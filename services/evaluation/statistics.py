@@ -139,9 +139,7 @@ def start_counts(num_starts: int, generator: np.random.Generator, *, num_draws: 
     All rollouts of a start are drawn together, since they share its objects and errors.
     """
     drawn = generator.integers(0, num_starts, (num_draws, num_starts))
-    counts = np.zeros((num_draws, num_starts))
-    np.add.at(counts, (np.arange(num_draws)[:, None], drawn), 1.0)
-    return counts
+    return np.array([np.bincount(row, minlength=num_starts) for row in drawn], np.float64)
 
 
 def pearson_of_draws(real: np.ndarray, imagined: np.ndarray) -> Float64[np.ndarray, " draws"]:

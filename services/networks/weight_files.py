@@ -3,16 +3,16 @@
 import hashlib
 import json
 import os
+import sys
 from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import torch
 from pydantic import BaseModel, ValidationError
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
-from torch.distributed.tensor import DTensor, distribute_tensor
 
 from dextouch.episodes import disk_errors
 from dextouch.errors import (
@@ -25,6 +25,10 @@ from dextouch.errors import (
     UnavailableError,
 )
 from dextouch.installation import install_command
+
+if TYPE_CHECKING:
+    from torch.distributed.tensor import DTensor
+    from typing_extensions import TypeIs
 
 # Of the services, which have weights of their own.
 _PACKAGE = Path(__file__).parents[1]
@@ -234,9 +238,16 @@ def on_device(network: Network, device: str) -> Network:
     return network.to(place)
 
 
+def is_sharded(tensor: Tensor) -> "TypeIs[DTensor]":
+    """Whether a tensor is sharded over processes."""
+    # No tensor is before the module is imported, which takes half as long as torch.
+    module = sys.modules.get("torch.distributed.tensor")
+    return module is not None and isinstance(tensor, module.DTensor)
+
+
 def memory_of(tensors: Mapping[str, Tensor]) -> int:
     """Bytes here of tensors, which may be on the meta device, or sharded over processes."""
-    here = (one.to_local() if isinstance(one, DTensor) else one for one in tensors.values())
+    here = (one.to_local() if is_sharded(one) else one for one in tensors.values())
     return sum(tensor.numel() * tensor.element_size() for tensor in here)
 
 
@@ -245,7 +256,7 @@ def allocate(network: nn.Module) -> None:
     for module in network.modules():
         for name, weight in list(module.named_parameters(recurse=False)):
             if weight.is_meta:
-                place = weight.device_mesh.device_type if isinstance(weight, DTensor) else "cpu"
+                place = weight.device_mesh.device_type if is_sharded(weight) else "cpu"
                 made = nn.Parameter(torch.empty_like(weight, device=place), weight.requires_grad)
                 setattr(module, name, made)
 
@@ -253,7 +264,9 @@ def allocate(network: nn.Module) -> None:
 @torch.no_grad()
 def fill(tensor: Tensor, whole: Tensor) -> None:
     """Copy a whole tensor into one that may be sharded, and of another precision."""
-    if isinstance(tensor, DTensor):
+    if is_sharded(tensor):
+        from torch.distributed.tensor import distribute_tensor
+
         mesh, placements = tensor.device_mesh, tensor.placements
         whole = distribute_tensor(whole, mesh, placements, src_data_rank=None)
     tensor.copy_(whole)

@@ -7,12 +7,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
+import structlog
 import torch
 
 from dextouch.clients import RolloutClient
 from dextouch.command_line import write_result
 from dextouch.episodes import EpisodeReader, EpisodeStore, Split, needs, scene_of, select_episodes
-from dextouch.errors import ConflictError
+from dextouch.errors import ConflictError, EndedError
 from dextouch.jobs import Workers, results_of, run_jobs
 from dextouch.schemas import EpisodeAttributes
 from dextouch.serving import configure_logging
@@ -37,6 +38,8 @@ from services.world_model.checkpoints import (
 from services.world_model.state_world import StateWorld
 from services.world_model.training.joint_dataset import read_episode
 from services.world_model.world import open_world
+
+logger = structlog.get_logger(__name__)
 
 WORLD = "world_model"
 # Episodes of a job on a cluster, which opens the model: some ten times as long as opening it.
@@ -79,7 +82,8 @@ def imagine_all(
 ) -> list[str]:
     """Imagine robot episodes of a store in another, and return the new ids; results are kept.
 
-    With `only_judged`, a state model draws only the images that the success classifier uses.
+    Those that the world cannot continue to their end are left out, with a warning. With
+    `only_judged`, a state model draws only the images that the success classifier uses.
     """
     source, target = EpisodeStore(episodes), EpisodeStore(output)
     torch.set_num_threads(1)
@@ -91,7 +95,11 @@ def imagine_all(
         for episode_id in episode_ids:
             reader = source.open(episode_id)
             steps = judged_steps(reader) if is_drawn_apart else None
-            made.append(imagine_episode(reader, client, WORLD, target, image_steps=steps))
+            try:
+                made.append(imagine_episode(reader, client, WORLD, target, image_steps=steps))
+            except EndedError as error:
+                # As of one that lasts too long: it must not keep the others back.
+                logger.warning("episode_not_imagined", episode_id=episode_id, reason=error.reason)
     return made
 
 
@@ -145,7 +153,7 @@ def imagined_main(argv: Sequence[str]) -> int:
     )
     episode_ids = [about.episode_id for about in chosen]
     count = len(imagine(options, episode_ids, only_judged=True))
-    print(f"{count} imagined")
+    print(f"{count} of {len(episode_ids)} imagined")
     write_result(options.json, {"imagined": count})
     return 0
 
@@ -162,7 +170,8 @@ def generate_main(arguments: Sequence[str]) -> int:
     target = EpisodeStore(options.store)
     num_bytes = sum(target.open(one).verify().num_bytes for one in made)
     print(
-        f"{len(made)} episodes imagined and verified, {num_bytes / 1e6:.1f} MB in {options.store}"
+        f"{len(made)} of {len(episode_ids)} episodes imagined and verified, "
+        f"{num_bytes / 1e6:.1f} MB in {options.store}"
     )
     if options.strips is not None:
         shown = [target.open(one) for one in sorted(made)[: options.num_strips]]

@@ -19,12 +19,10 @@ from services.world_model.settings import (
     TrainStateCommand,
     WorldModelSettings,
 )
-from services.world_model.training.distribution import joined_processes
-from services.world_model.training.joint_trainer import TrainingProgress, TrainingReport, train
-from services.world_model.training.latent_cache import fill_latent_cache
 from services.world_model.world import open_world
 
 if TYPE_CHECKING:
+    from services.world_model.training.joint_trainer import TrainingProgress, TrainingReport
     from services.world_model.training.state_trainer import StateReport
 
 
@@ -62,6 +60,8 @@ def run_cache(arguments: list[str]) -> int:
     settings = load_settings(paper_settings.CacheCommand, arguments)
     if settings.plan:
         return run_train(arguments)
+    from services.world_model.training.latent_cache import fill_latent_cache
+
     filled = fill_latent_cache(settings, lambda some: progress(some, "latents", len(some)))
     print(
         f"{filled.path}: {filled.num_windows} windows of {filled.num_episodes} episodes, "
@@ -72,9 +72,13 @@ def run_cache(arguments: list[str]) -> int:
 
 
 def _train(settings: paper_settings.TrainSettings, json_path: Path | None) -> int:
+    # Plans do without these imports.
+    from services.world_model.training.distribution import joined_processes
+    from services.world_model.training.joint_trainer import train
+
     lines = ProgressLines("training", has_bar=False)
 
-    def on_progress(now: TrainingProgress) -> None:
+    def on_progress(now: "TrainingProgress") -> None:
         losses = f"video {now.loss_video:.3f}  touch {now.loss_tactile:.3f}"
         lines.show(f"{100 * now.share:.0f} %  step {now.step}  {losses}")
 

@@ -301,7 +301,8 @@ class TrainCommand(CommandSettings, TrainSettings):
     json_path: Path | None = Field(default=None, alias="json", description=JSON_HELP)
     plan: CliImplicitFlag[bool] = Field(
         default=False,
-        description="print memory and FLOPs of a chunk and of this training, and what fits a card",
+        description="print memory and FLOPs of a chunk and of this training, and what fits a card, "
+        "in some ten CPU seconds",
     )
     plan_processes: int = Field(
         default=8, ge=1, description="processes that --plan shards the training over, too"

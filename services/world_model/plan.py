@@ -9,14 +9,14 @@ a few layers. In training activations count in float32.
 import weakref
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, is_dataclass, replace
-from functools import cache, partial
-from typing import Any, Final, TypeVar, cast
+from functools import cache
+from typing import Any, ClassVar, Final, TypeVar, cast
 
 import torch
 from torch import Tensor, nn
+from torch._ops import OpOverload
 from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_leaves
-from torch.utils.flop_counter import FlopCounterMode
+from torch.utils.flop_counter import flop_registry
 
 from services.networks.optimizer import learned_weights
 from services.networks.weight_files import memory_of
@@ -33,8 +33,9 @@ _PRECISIONS: Final[tuple[Precision, ...]] = ("float32", "bfloat16")
 _DECODING: Final = ("decode all images", "decode the last image")
 # Cards that choices of a training are compared with, in 1e9 bytes as all of the plan.
 _CARDS_GB: Final = (24, 80, 141)
-# Layers that deeper models are planned from.
-_FEW_LAYERS: Final = (3, 4)
+# Layers that deeper models are planned from, by what the last one adds; with fewer, sampler steps
+# still need more from layer to layer.
+_FEW_LAYERS: Final = 4
 # Text encoder of the published model, UMT5-XXL.
 _TEXT_ENCODER: Final = {
     "vocab_size": 256384, "d_model": 4096, "d_kv": 64, "d_ff": 10240, "num_layers": 24,
@@ -80,14 +81,11 @@ class Plan:
 
 
 @dataclass(frozen=True)
-class TrainingPlan:
-    """Memory of a training's process while it takes a step, in bytes.
+class _Weights:
+    """Bytes of the weights of a training.
 
-    Of all `weights`, codec and tokenizer are `whole` in every process; the `learned` have
-    gradients, two moments and maybe an average (`copies` without gradients). `layer` are weights of
-    a layer, `outer` those beside layers and whole parts. `step` is the most that forward and
-    backward take, with all gradients if there is one process, and `encoding` what the codec takes
-    for the latents.
+    Of all `weights`, codec and tokenizer are `whole` in every process; `learned` ones are trained.
+    `layer` are weights of a layer, `outer` those beside layers and whole parts.
     """
 
     weights: int
@@ -95,6 +93,17 @@ class TrainingPlan:
     learned: int
     outer: int
     layer: int
+
+
+@dataclass(frozen=True)
+class TrainingPlan(_Weights):
+    """Memory of a training's process while it takes a step, in bytes.
+
+    Learned weights have gradients, two moments and maybe an average (`copies` without gradients).
+    `step` is the most that forward and backward take, with all gradients if there is one process,
+    and `encoding` what the codec takes for the latents.
+    """
+
     step: int
     encoding: int
     copies: int
@@ -114,33 +123,70 @@ class TrainingPlan:
         return self.whole + shared // self.shards + gathered + max(self.step, self.encoding)
 
 
-PlanT = TypeVar("PlanT", Plan, TrainingPlan)
+PlanT = TypeVar("PlanT")
 
 
 class PeakMemory(TorchDispatchMode):  # type: ignore[no-untyped-call]
-    """Largest sum of the tensors made inside the context and alive at one time, in bytes."""
+    """Largest sum of the tensors made inside the context and alive at one time, in bytes.
+
+    Also counts FLOPs. Gradients given to `drop` are `dropped_bytes`; `kept_peak_bytes` is the peak
+    as if they had stayed. On the meta device an operation is computed once for tensors of the same
+    shapes, since its Python implementations there take ten times as long as making the results.
+    """
+
+    # Shape, stride and kind of the new tensors of an operation, its kind of result, and its FLOPs.
+    _known: ClassVar[dict[object, tuple[list[Any], type | None, int]]] = {}
 
     def __init__(self, given: Iterable[Tensor]) -> None:
         super().__init__()  # type: ignore[no-untyped-call]
-        self.peak_bytes = 0
+        self.flops = self.peak_bytes = self.kept_peak_bytes = self.dropped_bytes = 0
         self._now_bytes = 0
         # Views share the storage of their tensor. Held, since storages are known by identity.
         self._given = [tensor.untyped_storage() for tensor in given]
         self._alive = weakref.WeakSet(self._given)
 
+    @classmethod
+    def _should_skip_dynamo(cls) -> bool:
+        # Nothing is compiled here; to tell torch._dynamo so, torch would import it.
+        return False
+
     def __torch_dispatch__(
         self,
-        func: Callable[..., object],
+        func: OpOverload[..., Any],
         types: object,
         args: tuple[object, ...] = (),
         kwargs: Mapping[str, object] | None = None,
     ) -> object:
-        """Run an operation and count its new tensors."""
-        result = func(*args, **(kwargs or {}))
-        for leaf in tree_leaves(result):
-            if isinstance(leaf, Tensor):
-                self._count(leaf.untyped_storage())
+        """Run an operation and count its new tensors and FLOPs."""
+        kwargs = kwargs or {}
+        key = None if func.is_view else (func, _signature(args), _signature((*kwargs.items(),)))
+        known = self._known.get(key)
+        if known is None:
+            result = func(*args, **kwargs)
+            count = flop_registry.get(func.overloadpacket)
+            flops = 0 if count is None else count(*args, **kwargs, out_val=result)
+            kind = type(result) if isinstance(result, tuple | list) else None
+            results = [result] if kind is None else list(result)
+            if key and _are_new(results, (args, kwargs)):
+                made = [one if one is None else _form(one) for one in results]
+                self._known[key] = made, kind, flops
+        else:
+            made, kind, flops = known
+            results = [
+                one and torch.empty_strided(*one[:2], dtype=one[2], device="meta") for one in made
+            ]
+            result = results[0] if kind is None else kind(results)
+        self.flops += flops
+        for one in results:
+            if isinstance(one, Tensor):
+                self._count(one.untyped_storage())
         return result
+
+    def drop(self, weight: Tensor) -> None:
+        """Free the gradient of a weight."""
+        if weight.grad is not None:
+            self.dropped_bytes += weight.grad.untyped_storage().nbytes()
+            weight.grad = None
 
     def _count(self, storage: torch.UntypedStorage) -> None:
         if storage in self._alive:
@@ -149,10 +195,35 @@ class PeakMemory(TorchDispatchMode):  # type: ignore[no-untyped-call]
         self._alive.add(storage)
         self._now_bytes += size
         self.peak_bytes = max(self.peak_bytes, self._now_bytes)
+        self.kept_peak_bytes = max(self.kept_peak_bytes, self._now_bytes + self.dropped_bytes)
         weakref.finalize(storage, self._free, size)
 
     def _free(self, size: int) -> None:
         self._now_bytes -= size
+
+
+def _signature(value: object) -> object:
+    """What the shapes of an operation's results depend on."""
+    if isinstance(value, Tensor):
+        # Those of other devices are equal to nothing else.
+        return _form(value) if value.is_meta else object()
+    if isinstance(value, tuple | list):
+        return tuple(map(_signature, value))
+    return type(value), value
+
+
+def _form(tensor: Tensor) -> tuple[torch.Size, tuple[int, ...], torch.dtype]:
+    return tensor.shape, tensor.stride(), tensor.dtype
+
+
+def _are_new(results: list[object], given: object) -> bool:
+    """Whether all results are on the meta device, and none shares the memory of what was given."""
+    old = {tensor.untyped_storage() for tensor in _tensors_of(given)}
+    return all(
+        one is None
+        or (isinstance(one, Tensor) and one.is_meta and one.untyped_storage() not in old)
+        for one in results
+    )
 
 
 def plan_table(config: NetworkConfig) -> str:
@@ -202,15 +273,20 @@ def plan_table(config: NetworkConfig) -> str:
 
 def plan_of(config: NetworkConfig) -> Plan:
     """Plan of one action chunk of the greatest length."""
-    return _of_depth(config.num_layers, partial(_plan_of, config))
+    return _of_depth(config, _plan_of)
 
 
-def _of_depth(depth: int, planned: Callable[[int], PlanT]) -> PlanT:
+def _of_depth(config: NetworkConfig, planned: Callable[[JointWorldModel], PlanT]) -> PlanT:
     """A plan of many layers from those of few: each further one needs the same."""
-    if depth <= _FEW_LAYERS[-1]:
-        return planned(depth)
-    few, more = (planned(num_layers) for num_layers in _FEW_LAYERS)
-    return cast("PlanT", _further(few, more, depth - _FEW_LAYERS[-1]))
+    further = config.num_layers - _FEW_LAYERS
+    with torch.device("meta"):
+        few_layers = config.model_copy(update={"num_layers": config.num_layers - max(0, further)})
+        model = JointWorldModel(few_layers)
+        plan = planned(model)
+        if further <= 0:
+            return plan
+        del model.layers[-1]
+        return cast("PlanT", _further(planned(model), plan, further))
 
 
 def _further(few: object, more: object, num: int) -> object:
@@ -218,27 +294,24 @@ def _further(few: object, more: object, num: int) -> object:
         return more + num * (more - few)
     if isinstance(few, tuple) and isinstance(more, tuple):
         return tuple(_further(one, other, num) for one, other in zip(few, more, strict=True))
-    if isinstance(few, Plan | TrainingPlan | Part | Work):
+    if isinstance(few, Plan | Part | Work | _Weights):
         amounts = {name: _further(one, vars(more)[name], num) for name, one in vars(few).items()}
         return type(few)(**amounts)  # type: ignore[arg-type]
     return more
 
 
-def _plan_of(config: NetworkConfig, depth: int) -> Plan:
-    config = config.model_copy(update={"num_layers": depth})
-    steps = config.max_steps - 1
-    with torch.device("meta"), torch.no_grad():
-        model = JointWorldModel(config).eval()
-        work, kept_bytes = _work(model, 1 + steps)
-        return Plan(
-            num_steps=steps,
-            num_video_tokens=(num_latents(1 + steps) + config.past_images)
-            * config.tokens_per_frame,
-            num_tactile_tokens=(1 + steps) * 2 * model.tokenizer.num_tokens,
-            parts=_parts(model),
-            work=work,
-            kept_bytes=kept_bytes,
-        )
+def _plan_of(model: JointWorldModel) -> Plan:
+    config, steps = model.config, model.config.max_steps - 1
+    with torch.no_grad():
+        work, kept_bytes = _work(model.eval(), 1 + steps)
+    return Plan(
+        num_steps=steps,
+        num_video_tokens=(num_latents(1 + steps) + config.past_images) * config.tokens_per_frame,
+        num_tactile_tokens=(1 + steps) * 2 * model.tokenizer.num_tokens,
+        parts=_parts(model),
+        work=work,
+        kept_bytes=kept_bytes,
+    )
 
 
 def training_table(settings: TrainSettings, num_processes: int) -> str:
@@ -285,32 +358,71 @@ def _choices(settings: TrainSettings) -> dict[str, TrainSettings]:
 def training_plan(settings: TrainSettings, num_processes: int = 1) -> TrainingPlan:
     """Plan of a step with the longest windows, in one process of several; as `with_adapters`."""
     settings = settings.with_adapters()
-    return _of_depth(settings.network.num_layers, partial(_training_plan, settings, num_processes))
-
-
-def _training_plan(settings: TrainSettings, num_processes: int, depth: int) -> TrainingPlan:
-    config = settings.network.model_copy(update={"num_layers": depth})
+    config, accumulate = settings.network, settings.accumulate
     shards = max(1, num_processes // settings.replicas)
-    windows = max(1, settings.optimizer.batch // (num_processes * settings.accumulate))
-    with torch.device("meta"):
-        model = JointWorldModel(config).train()
-        if settings.freeze_video or settings.lora.rank:
+    windows = max(1, settings.optimizer.batch // (num_processes * accumulate))
+    is_frozen = settings.freeze_video or settings.lora.rank > 0
+    weights, *steps = _pass(config, windows, is_frozen=is_frozen, recompute=settings.recompute)
+    return TrainingPlan(
+        **vars(weights),
+        step=steps[0 if shards > 1 else min(accumulate, 2)],
+        encoding=_encoding_bytes(_of_codec(config), windows),
+        copies=2 + (settings.optimizer.ema_decay > 0.0),
+        shards=shards,
+    )
+
+
+@cache
+def _pass(
+    config: NetworkConfig, num_windows: int, *, is_frozen: bool, recompute: bool
+) -> tuple[_Weights, int, int, int]:
+    """Weights, and the peak of forward and backward: sharded, of one part of a batch, of several.
+
+    Several processes and choices of a training share a pass.
+    """
+
+    def planned(model: JointWorldModel) -> tuple[_Weights, int, int, int]:
+        model.train()
+        if is_frozen:
             freeze_pretrained(model)
         for layer in model.joint_layers():
-            layer.recompute = settings.recompute
-        whole = sum(memory_of(part.state_dict()) for part in (model.codec, model.tokenizer))
-        layers, weights = memory_of(model.layers.state_dict()), memory_of(model.state_dict())
-        return TrainingPlan(
-            weights=weights,
-            whole=whole,
-            learned=memory_of(learned_weights(model)),
-            outer=weights - whole - layers,
-            layer=memory_of(model.joint_layers()[0].state_dict()),
-            step=_step_bytes(model, windows, min(settings.accumulate, 2), is_sharded=shards > 1),
-            encoding=_encoding_bytes(_of_codec(config), windows),
-            copies=2 + (settings.optimizer.ema_decay > 0.0),
-            shards=shards,
-        )
+            layer.recompute = recompute
+        memory = _backward(model, num_windows)
+        # Gradients of the parts before are there while the last part runs.
+        several = memory.peak_bytes + memory.dropped_bytes
+        return _weights(model), memory.peak_bytes, memory.kept_peak_bytes, several
+
+    return _of_depth(config, planned)
+
+
+def _weights(model: JointWorldModel) -> _Weights:
+    whole = sum(memory_of(part.state_dict()) for part in (model.codec, model.tokenizer))
+    layers, weights = memory_of(model.layers.state_dict()), memory_of(model.state_dict())
+    return _Weights(
+        weights=weights,
+        whole=whole,
+        learned=memory_of(learned_weights(model)),
+        outer=weights - whole - layers,
+        layer=memory_of(model.joint_layers()[0].state_dict()),
+    )
+
+
+def _backward(model: JointWorldModel, num_windows: int) -> PeakMemory:
+    """Memory of forward and backward, of which no gradient stays."""
+    steps = model.config.max_steps
+    inputs = _inputs(model.config, steps, num_windows)
+    first, noisy = _latents(model, steps, num_windows)
+    t = torch.ones(num_windows)
+    with PeakMemory((*model.parameters(), *model.buffers())) as memory:
+        hooks = [
+            weight.register_post_accumulate_grad_hook(memory.drop)  # type: ignore[no-untyped-call]
+            for weight in learned_weights(model).values()
+        ]
+        guess = model(inputs, first, noisy, t)
+        torch.autograd.backward(guess.video.square().mean() + guess.tactile.square().mean())
+    for hook in hooks:
+        hook.remove()
+    return memory
 
 
 def _of_codec(config: NetworkConfig) -> NetworkConfig:
@@ -334,32 +446,6 @@ def _encoding_bytes(config: NetworkConfig, num_windows: int) -> int:
     return memory.peak_bytes
 
 
-def _step_bytes(
-    model: JointWorldModel, num_windows: int, num_parts: int, *, is_sharded: bool
-) -> int:
-    """Peak of forward and backward of parts of a batch; without gradients if these are sharded."""
-    steps = model.config.max_steps
-    inputs = _inputs(model.config, steps, num_windows)
-    first, noisy = _latents(model, steps, num_windows)
-    if is_sharded:
-        num_parts = 1
-        for weight in learned_weights(model).values():
-            weight.register_post_accumulate_grad_hook(  # type: ignore[no-untyped-call]
-                _drop_gradient
-            )
-    t = torch.ones(num_windows)
-    with PeakMemory((*model.parameters(), *model.buffers())) as memory:
-        for _ in range(num_parts):
-            guess = model(inputs, first, noisy, t)
-            torch.autograd.backward(guess.video.square().mean() + guess.tactile.square().mean())
-            del guess
-    return memory.peak_bytes
-
-
-def _drop_gradient(weight: Tensor) -> None:
-    weight.grad = None
-
-
 def _parts(model: JointWorldModel) -> tuple[Part, ...]:
     ends = [model.video_condition, model.video, *([model.views] if model.views else [])]
     video = [*ends, *(layer.video for layer in model.layers)]
@@ -372,10 +458,7 @@ def _parts(model: JointWorldModel) -> tuple[Part, ...]:
     }
     wan = model.config.wan
     if wan is not None and wan.text_width == _TEXT_ENCODER["d_model"]:
-        from transformers import UMT5Config, UMT5EncoderModel
-
-        encoder = UMT5EncoderModel(UMT5Config(**_TEXT_ENCODER)).to(wan.dtype)
-        groups["text encoder (once per instruction)"] = [encoder]
+        groups["text encoder (once per instruction)"] = [_text_encoder(wan.dtype)]
     parts = []
     for name, group in groups.items():
         modules = nn.ModuleList(group)
@@ -385,23 +468,32 @@ def _parts(model: JointWorldModel) -> tuple[Part, ...]:
     return tuple(parts)
 
 
+@cache
+def _text_encoder(dtype: torch.dtype) -> nn.Module:
+    from transformers import UMT5Config, UMT5EncoderModel
+
+    return UMT5EncoderModel(UMT5Config(**_TEXT_ENCODER)).to(dtype)
+
+
 def _work(model: JointWorldModel, num_steps: int) -> tuple[tuple[Work, ...], int]:
     """Computations of a chunk, and the memory that the sampler's steps share."""
     config, inputs = model.config, _inputs(model.config, num_steps)
     first, noisy = _latents(model, num_steps)
 
-    def shared() -> Context:
+    def share() -> Context:
         context = model.context(inputs, first)
         return replace(context, clean=model.clean_tokens(context, noisy))
 
-    context, steps = shared(), config.sampling_steps
-    jobs: dict[str, tuple[int, Callable[[], Any]]] = {
-        "what sampler steps share": (1, shared),
-        "one sampler step": (steps, lambda: model.denoise(context, noisy, torch.ones(1))),
-    }
+    def step() -> JointLatents:
+        return model.denoise(context, noisy, torch.ones(1))
+
+    context = share()
     kept = {str(id(tensor)): tensor for tensor in _tensors_of(context)}
+    shared = _measured(("what sampler steps share", 1), share, model, kept.values())
+    steps = ("one sampler step", config.sampling_steps)
+    sampled = _measured(steps, step, model, kept.values())
     encoded, *decoded = _codec_work(_of_codec(config), num_steps)
-    return (encoded, *_counted(jobs, model, kept.values()), *decoded), memory_of(kept)
+    return (encoded, shared, sampled, *decoded), memory_of(kept)
 
 
 @cache
@@ -409,25 +501,24 @@ def _codec_work(config: NetworkConfig, num_steps: int) -> tuple[Work, ...]:
     """Computations of codec and tokenizer, which are equal in both precisions and all depths."""
     model, inputs = JointWorldModel(config).eval(), _inputs(config, num_steps)
     first, noisy = _latents(model, num_steps)
-    jobs: dict[str, tuple[int, Callable[[], Any]]] = {
-        "encode the first image": (1, lambda: model.first_latents(inputs)),
-        _DECODING[0]: (1, lambda: model.decode(first, noisy)),
-        _DECODING[1]: (1, lambda: model.decode(first, noisy, all_images=False)),
+    jobs: dict[str, Callable[[], object]] = {
+        "encode the first image": lambda: model.first_latents(inputs),
+        _DECODING[0]: lambda: model.decode(first, noisy),
+        _DECODING[1]: lambda: model.decode(first, noisy, all_images=False),
     }
-    return _counted(jobs, model)
+    return tuple(_measured((name, 1), run, model) for name, run in jobs.items())
 
 
-def _counted(
-    jobs: Mapping[str, tuple[int, Callable[[], Any]]],
+def _measured(
+    times: tuple[str, int],
+    run: Callable[[], object],
     model: JointWorldModel,
     kept: Iterable[Tensor] = (),
-) -> tuple[Work, ...]:
-    work, given = [], (*model.parameters(), *model.buffers(), *kept)
-    for name, (times, run) in jobs.items():
-        with PeakMemory(given) as memory, FlopCounterMode(display=False) as counter:
-            run()
-        work.append(Work(name, times, counter.get_total_flops(), memory.peak_bytes))
-    return tuple(work)
+) -> Work:
+    """A computation that has a name and is done some times, beside what is kept."""
+    with PeakMemory((*model.parameters(), *model.buffers(), *kept)) as memory:
+        run()
+    return Work(*times, memory.flops, memory.peak_bytes)
 
 
 def _tensors_of(kept: object) -> list[Tensor]:
@@ -437,7 +528,7 @@ def _tensors_of(kept: object) -> list[Tensor]:
         return [tensor for part in vars(kept).values() for tensor in _tensors_of(part)]
     if isinstance(kept, dict):
         kept = tuple(kept.values())
-    if isinstance(kept, tuple):
+    if isinstance(kept, tuple | list):
         return [tensor for part in kept for tensor in _tensors_of(part)]
     return []
 

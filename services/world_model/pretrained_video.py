@@ -9,7 +9,6 @@ from typing import Final
 import torch
 from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
-from torch.distributed.tensor import DTensor
 
 from dextouch.errors import CorruptDataError, InvalidInputError, NotFoundError
 from services.networks import weight_files
@@ -200,7 +199,7 @@ def load_weights(
 
 def _available(weights: Mapping[str, Tensor]) -> int | None:
     """Memory for this process's weights: that of its GPU, or its part of the machine's."""
-    meshes = [one.device_mesh for one in weights.values() if isinstance(one, DTensor)]
+    meshes = [one.device_mesh for one in weights.values() if weight_files.is_sharded(one)]
     if meshes and meshes[0].device_type == "cuda":
         return torch.cuda.mem_get_info()[0]
     free = weight_files.available_memory()

@@ -171,3 +171,16 @@ def test_streams_without_samples_are_refused(estimate):
     for streams_of_take in ((*nothing, *nothing), (*nothing, times_ns, values)):
         with pytest.raises(InvalidInputError, match="got 0 stamps"):
             estimate(*streams_of_take)
+
+
+def test_samples_that_come_in_bursts_take_no_finer_grid():
+    """Four at a time within microseconds, as a busy host takes them from its buffers."""
+    rng = np.random.default_rng(0)
+    t_ns = np.arange(1200) * 10_000_000
+    signal = np.convolve(rng.normal(size=1200), np.hanning(30), "same")
+    number = np.arange(1200)
+    bursts_ns = (number // 4 * 4 + 3) * 10_000_000 + number % 4 * 1000
+    found = estimate_time_offset(t_ns, signal, bursts_ns, signal)
+    # On average a sample comes one and a half periods late.
+    assert abs(found.offset_ns + 15e6) < 3 * found.sigma_ns
+    assert found.sigma_ns < 5e6

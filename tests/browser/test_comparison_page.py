@@ -331,6 +331,11 @@ def test_a_world_that_ends_its_rollout_says_why(page, serve_dashboard, item):
     ended = "The world model ended its rollout: the spot is out of sight"
     expect(page.locator("#comparison_note")).to_have_text(ended)
     expect(page.locator("#comparison_step")).to_have_attribute("max", "48")
+    # Of a comparison that somebody else begins now, it would not be true.
+    begun = httpx.post(f"{address}/v1/comparisons", json={"task": "reach", "seed": SEED})
+    assert begun.status_code == 202
+    expect(page.locator("#comparison_state")).to_contain_text("running")
+    expect(page.locator("#comparison_note")).to_have_text("")
 
 
 @pytest.mark.parametrize(

@@ -66,6 +66,28 @@ def test_a_person_rates_all_rollouts(serve, page, settings):
 
 
 @pytest.mark.slow
+def test_a_key_that_is_held_down_answers_for_one_rollout(serve, page, settings):
+    page.goto(serve(create_rating_app(settings)))
+    page.get_by_label("Your name").fill("ada")
+    page.get_by_role("button", name="Start").click()
+    expect(page.locator("#progress")).to_have_text("ada: 0 rated, 3 to go")
+    page.keyboard.down("c")
+    expect(page.locator("#progress")).to_have_text("ada: 1 rated, 2 to go")
+    # As the keyboard repeats it.
+    page.keyboard.down("c")
+    for _ in range(3):
+        page.keyboard.down("1")
+    touched = page.locator(".criterion").nth(0).get_by_role("button", name="Yes")
+    expect(touched).to_have_attribute("aria-pressed", "true")
+    page.keyboard.up("c")
+    page.keyboard.up("1")
+    for held in ("2", "Enter"):
+        page.keyboard.press(held)
+    expect(page.locator("#progress")).to_have_text("ada: 2 rated, 1 to go")
+    assert [one.mark.cannot_judge for one in MarkLog(settings.marks).history()] == [True, False]
+
+
+@pytest.mark.slow
 def test_a_wrong_key_is_said_and_the_right_one_opens_the_page(serve, page, settings):
     key = {"name": "ada", "key": "a-key-of-some-length", "scopes": ("rate",)}
     app = create_rating_app(RatingSettings(**settings.model_dump() | {"api_keys": (key,)}))

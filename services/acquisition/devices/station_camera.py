@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from time import CLOCK_MONOTONIC, CLOCK_MONOTONIC_RAW
+from time import CLOCK_MONOTONIC
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -27,7 +27,7 @@ from dextouch.streams import (
     Sample,
     StreamDescriptor,
 )
-from services.acquisition.clock import StationClock
+from services.acquisition.clock import StationClock, station_offset_ns
 from services.acquisition.devices.kinds import CameraStream, DeviceKind, DeviceSettings
 from services.acquisition.drivers import images
 from services.acquisition.drivers.base import Decoder, Driver, Readings
@@ -395,7 +395,8 @@ class StationCamera(Driver):
         max_encode_wait_s: float | None = None,
     ) -> None:
         self._stamps = DriverStamps(settings)
-        # CLOCK_MONOTONIC and CLOCK_MONOTONIC_RAW at the last image but one and at the last.
+        # CLOCK_MONOTONIC and what it needs to be on the station's clock, but for the time in
+        # suspend, at the last image but one and at the last.
         self._clock_pairs: deque[tuple[int, int]] = deque(maxlen=2)
         super().__init__(settings.stream, transport=link, decoder=self._stamps, clock=clock)
         self._link, self._settings = link, settings
@@ -448,15 +449,19 @@ class StationCamera(Driver):
         Raises:
             DeviceError: the camera is gone, silent, or gives other images than asked for.
         """
+        asked_ns = self._clock.now_ns()
         if self._link.wait(READ_TIMEOUT_S):
             t_host_ns = self._clock.now_ns()
-            pair = [self._clock.read_ns(which) for which in (CLOCK_MONOTONIC, CLOCK_MONOTONIC_RAW)]
-            self._clock_pairs.append((pair[0], pair[1]))
+            monotonic_ns = self._clock.read_ns(CLOCK_MONOTONIC)
+            offset_ns = station_offset_ns(self._clock) - self._clock.suspended_ns()
+            self._clock_pairs.append((monotonic_ns, offset_ns))
             self._heard_ns = t_host_ns
             self._silence_ns = max(MIN_SILENCE_NS, SILENT_PERIODS * self._settings.period_ns)
             self._take(self._link.retrieve(), t_host_ns)
         else:
-            self._check_silence()
+            # A busy host may hold this thread up after its wait, while images come.
+            waited_ns = asked_ns + round(READ_TIMEOUT_S * 1e9)
+            self._check_silence(min(waited_ns, self._clock.now_ns()))
         samples = self._queue.collect(self._encode_wait_s)
         return {self.name: samples} if samples else {}
 
@@ -494,14 +499,14 @@ class StationCamera(Driver):
         """A stamp on CLOCK_MONOTONIC, whose rate NTP changes, on the station's clock."""
         # A stamp lies between the readings at its image and at the one before.
         since_ns = [monotonic_ns - t_driver_ns for monotonic_ns, _ in self._clock_pairs]
-        ahead_ns = [raw_ns - monotonic_ns for monotonic_ns, raw_ns in self._clock_pairs]
+        ahead_ns = [offset_ns for _, offset_ns in self._clock_pairs]
         rest_ns = np.interp(0, since_ns, [ahead - ahead_ns[-1] for ahead in ahead_ns])
         return t_driver_ns + ahead_ns[-1] + round(float(rest_ns)) + self._clock.suspended_ns()
 
-    def _check_silence(self) -> None:
+    def _check_silence(self, now_ns: int) -> None:
         if self._heard_ns is None:
             return
-        silent_ns = self._clock.now_ns() - self._heard_ns
+        silent_ns = now_ns - self._heard_ns
         if silent_ns > self._silence_ns:
             raise DeviceError(
                 f"{self.name}: no image for {silent_ns / NS_PER_MS:.0f} ms from {self.info}, "

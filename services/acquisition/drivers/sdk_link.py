@@ -143,13 +143,16 @@ class FreshnessGate:
 
     The source's clock has an arbitrary origin, so the age is measured relative to the fastest
     sample so far; that reference may drift by 200 ppm. A delay that existed when the connection
-    began cannot be detected.
+    began cannot be detected. Stamps that advance for 200 ms behind the newest one are of a clock
+    that was set: what waited somewhere does not come for so long.
     """
 
     def __init__(self) -> None:
         self._offset_ns: float | None = None
         self._t_host_ns = 0
         self._t_device_ns = 0
+        # The last stamp behind the newest one, and since when such stamps advance.
+        self._behind: tuple[int, int] | None = None
 
     def reset(self) -> None:
         """Another source, or the same one after a restart, may follow."""
@@ -161,11 +164,16 @@ class FreshnessGate:
         if self._offset_ns is None or t_device_ns < self._t_device_ns - RESTART_NS:
             self._offset_ns = delay_ns
         elif t_device_ns <= self._t_device_ns:
-            return False
+            last_ns, since_ns = self._behind or (t_device_ns, t_host_ns)
+            since_ns = since_ns if t_device_ns > last_ns else t_host_ns
+            self._behind = t_device_ns, since_ns
+            if t_host_ns - since_ns < MAX_AGE_NS:
+                return False
+            self._offset_ns = delay_ns
         else:
             drift_ns = (t_host_ns - self._t_host_ns) * (MAX_DRIFT_PPM * 1e-6)
             self._offset_ns = min(delay_ns, self._offset_ns + drift_ns)
-        self._t_host_ns, self._t_device_ns = t_host_ns, t_device_ns
+        self._t_host_ns, self._t_device_ns, self._behind = t_host_ns, t_device_ns, None
         return delay_ns - self._offset_ns <= MAX_AGE_NS
 
 
@@ -334,12 +342,12 @@ class BridgeDriver(Driver):
         if self._first:
             first, self._first = self._first, {}
             return first
+        # Before the read: a busy host may hold this thread up after it, while data come.
+        silence_ns = self._clock.now_ns() - self._t_heard_ns
         data = self.transport.read()
-        t_host_ns = self._clock.now_ns()
         if data:
-            self._t_heard_ns = t_host_ns
-            return self.decoder.decode(data, t_host_ns)
-        silence_ns = t_host_ns - self._t_heard_ns
+            self._t_heard_ns = self._clock.now_ns()
+            return self.decoder.decode(data, self._t_heard_ns)
         if silence_ns > SILENCE_NS:
             raise StaleDataError(
                 f"{self.name}: {self.info} has sent nothing for {silence_ns / 1e6:.0f} ms, "

@@ -57,6 +57,12 @@ LATE_PERIODS = round(CODES["late"].warn)
 STATION = "station"
 
 
+def longest_gap_ns(descriptor: StreamDescriptor) -> int:
+    """How long a stream may give nothing: a slow one for 3 of its periods at least."""
+    limit_ns = STALE_AFTER_NS.get(descriptor.kind, STALE_AFTER_OTHERS_NS)
+    return max(limit_ns, LATE_PERIODS * descriptor.period_ns())
+
+
 class _Watched:
     """The station or one of its streams, with its checks and their latest results."""
 
@@ -106,14 +112,11 @@ class _WatchedStream(_Watched):
     def stale_code(self, now_ns: int) -> schemas.StaleCode | None:
         """Why the stream is stale, None when it is not.
 
-        "unplugged" when the device is not open, "silent" when it is and nothing comes; a slow
-        stream may take 3 of its periods at least.
+        "unplugged" when the device is not open, "silent" when it is and nothing comes.
         """
         if not self._supervisor.connected.is_set():
             return "unplugged"
-        limit_ns = STALE_AFTER_NS.get(self._descriptor.kind, STALE_AFTER_OTHERS_NS)
-        limit_ns = max(limit_ns, LATE_PERIODS * self._descriptor.period_ns())
-        last_ns = self.counters.last_t_host_ns
+        limit_ns, last_ns = longest_gap_ns(self._descriptor), self.counters.last_t_host_ns
         return "silent" if last_ns is None or now_ns - last_ns > limit_ns else None
 
     def health(self, now_ns: int) -> schemas.StreamHealth:

@@ -8,7 +8,6 @@ import contextlib
 import ctypes
 import json
 import socket
-import sys
 import threading
 import time
 from abc import ABC, abstractmethod
@@ -46,10 +45,6 @@ from services.acquisition.drivers.sdk_link import (
     FrameConvention,
 )
 
-# Two clocks are read together in a few µs; where it took longer, the process was interrupted.
-# Chosen: ten attempts, since even a busy machine interrupts fewer than one of two.
-READ_GAP_NS = 20_000
-CLOCK_READS = 10
 # Result and argument types of a shared library's functions, by their names.
 Functions = Mapping[str, tuple[object, tuple[object, ...]]]
 # Sources whose axes are ours already: right-handed, z up.
@@ -281,26 +276,6 @@ class Pace:
         missed = max(0, (now_ns - self._due_ns) // self._period_ns)
         self._due_ns += (missed + 1) * self._period_ns
         time.sleep((self._due_ns - now_ns) / 1e9)
-
-
-def station_offset_ns(clock: StationClock) -> int:
-    """What a recent stamp on CLOCK_MONOTONIC of this host needs to be on the station's clock.
-
-    NTP slews CLOCK_MONOTONIC against the station's clock, by 500 ppm (the kernel) or more (chrony),
-    so it is read anew for every few stamps: for one of a tenth of a second ago 500 ppm are 50 µs.
-    A reading that was interrupted is repeated; what remains is below half of READ_GAP_NS.
-    """
-    gap_ns, offset_ns = sys.maxsize, 0
-    for _ in range(CLOCK_READS):
-        before_ns = clock.now_ns()
-        monotonic_ns = clock.read_ns(time.CLOCK_MONOTONIC)
-        after_ns = clock.now_ns()
-        if after_ns - before_ns < gap_ns:
-            gap_ns = after_ns - before_ns
-            offset_ns = (before_ns + after_ns) // 2 - monotonic_ns
-        if gap_ns <= READ_GAP_NS:
-            break
-    return offset_ns
 
 
 @dataclass

@@ -13,6 +13,7 @@ from math import isfinite
 from typing import Any
 
 from dextouch.errors import DeviceError, InvalidInputError
+from services.acquisition.clock import station_offset_ns
 from services.acquisition.drivers.packets import SOURCES
 from services.acquisition.drivers.sdk_link import MAX_CHANNELS, BridgeHello
 from services.acquisition.sdk_bridges import bridge
@@ -91,7 +92,7 @@ class LslStream(bridge.Source):
         samples, stamps = self._guarded(
             lambda: self._inlet.pull_chunk(timeout=READ_S, max_samples=MAX_SAMPLES, min_samples=1)
         )
-        offset_ns = bridge.station_offset_ns(self._clock)
+        offset_ns = station_offset_ns(self._clock)
         readings = []
         for values, stamp_s in zip(samples, stamps, strict=True):
             corrected_s = stamp_s + self._correction_s

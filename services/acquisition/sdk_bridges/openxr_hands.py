@@ -19,6 +19,7 @@ import numpy as np
 from dextouch.errors import DeviceError
 from dextouch.hands import NODES
 from dextouch.tactile.layout import SIDES, Side
+from services.acquisition.clock import station_offset_ns
 from services.acquisition.devices.finger_tracker import NOMINAL_RATE_HZ
 from services.acquisition.drivers.sdk_link import BridgeHello
 from services.acquisition.sdk_bridges import bridge
@@ -197,7 +198,7 @@ class OpenXrHands(bridge.Source):
             byref(Timespec(seconds, nanoseconds)),
             byref(xr_time),
         )
-        t_ns = t_monotonic_ns + bridge.station_offset_ns(self._clock)
+        t_ns = t_monotonic_ns + station_offset_ns(self._clock)
         readings = (self._reading(side, xr_time, t_ns) for side in self._devices)
         return [reading for reading in readings if reading is not None]
 

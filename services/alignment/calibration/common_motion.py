@@ -22,6 +22,7 @@ from services.alignment.calibration.time_offset import (
     checked_signal,
     estimate_time_offset,
     low_passed,
+    usual_period_s,
 )
 from services.alignment.markers import gray_image
 
@@ -180,7 +181,7 @@ def pair_offset(a: Turning, b: Turning) -> TimeOffset:
     first_ns = a.t_ns[:1]
     t_a, mine = checked_signal("times: stream a", a.t_ns, a.velocity_rad_s, first_ns)
     t_b, other = checked_signal("times: stream b", b.t_ns, b.velocity_rad_s, first_ns)
-    step_s = 0.5 * min(float(np.median(np.diff(t_a))), float(np.median(np.diff(t_b))))
+    step_s = 0.5 * min(usual_period_s(t_a), usual_period_s(t_b))
     grid, smooth_a = low_passed(t_a, mine, step_s)
     grid_b, smooth_b = low_passed(t_b, other, step_s)
     spline = CubicSpline(grid_b, smooth_b)

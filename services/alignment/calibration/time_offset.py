@@ -60,7 +60,7 @@ def estimate_time_offset(
             )
     if a.shape[1] != b.shape[1]:
         raise ShapeError(f"time offset: got {a.shape[1]} and {b.shape[1]} components")
-    step_s = 0.5 * min(float(np.median(np.diff(t_a))), float(np.median(np.diff(t_b))))
+    step_s = 0.5 * min(usual_period_s(t_a), usual_period_s(t_b))
     grid_a, smooth_a = low_passed(t_a, a, step_s)
     grid_b, smooth_b = low_passed(t_b, b, step_s)
     spline_b = CubicSpline(grid_b, smooth_b)
@@ -130,6 +130,11 @@ def checked_signal(
     return (t_ns - reference_ns) * 1e-9, values
 
 
+def usual_period_s(t_s: Float64[np.ndarray, " n"]) -> float:
+    """The median period; of samples that come in bursts, half of the mean one."""
+    return max(float(np.median(np.diff(t_s))), float(t_s[-1] - t_s[0]) / 2 / (len(t_s) - 1))
+
+
 def low_passed(
     t_s: np.ndarray, values: np.ndarray, step_s: float
 ) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, "n k"]]:
@@ -137,8 +142,7 @@ def low_passed(
     num = int((t_s[-1] - t_s[0]) / step_s) + 1
     grid = t_s[0] + step_s * np.arange(num)
     uniform = np.stack([np.interp(grid, t_s, column) for column in values.T], axis=1)
-    rate_hz = float(1 / np.median(np.diff(t_s)))
-    cutoff_hz = min(CUTOFF_HZ, 0.4 * rate_hz)
+    cutoff_hz = min(CUTOFF_HZ, 0.4 / usual_period_s(t_s))
     sections = butter(2, cutoff_hz, fs=1 / step_s, output="sos")
     return grid, np.asarray(sosfiltfilt(sections, uniform, axis=0))
 

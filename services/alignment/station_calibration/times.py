@@ -13,7 +13,7 @@ from dextouch.geometry import distortion_of, transform_from_pose
 from dextouch.hands import PALM_NODES
 from dextouch.images import decode_jpeg
 from dextouch.schemas import Matrix
-from dextouch.streams import COMMANDED, H264_UNIT, JPEG_UNIT
+from dextouch.streams import COMMANDED, H264_UNIT, JPEG_UNIT, StreamDescriptor
 from services.alignment.calibration.common_motion import (
     SharedTimes,
     Turning,
@@ -89,21 +89,33 @@ def _turning(
     descriptor = reader.streams[name]
     if descriptor.kind == "image":
         return _camera_turning(reader, name, cameras, where)
-    if descriptor.kind == "pose" and not name.endswith(COMMANDED):
-        if descriptor.shape != (7,):
-            return f"has poses of shape {descriptor.shape}"
-    elif descriptor.kind != "keypoints":
-        return "shows no turning; for gloves use `latency` with taps"
-    elif descriptor.frame not in {"world", "tracker"}:
-        return "has keypoints in wrist axes, which do not turn with the hand"
+    if (reason := _unsuitable(descriptor)) is not None:
+        return reason
     stream = TakeStream(where, descriptor, reader.read(name), reader.attributes.calibration)
     if descriptor.kind == "pose":
-        t_ns, poses = stream.poses()
+        try:
+            t_ns, poses = stream.poses()
+        except InvalidInputError as error:
+            # Of all that is recorded a tracker may be switched off.
+            return f"is not used: {error.message}"
         return turning_of_rotations(t_ns, transform_from_pose(poses)[:, :3, :3])
     t_ns, points_m = stream.timed()
     palm_m = points_m[:, PALM_NODES].astype(np.float64)
     whole = np.isfinite(palm_m).all(axis=(1, 2))
+    if not whole.any():
+        return "has no sample in which the whole palm is seen"
     return turning_of_points(t_ns[whole], palm_m[whole])
+
+
+def _unsuitable(descriptor: StreamDescriptor) -> str | None:
+    if descriptor.kind == "pose" and not descriptor.name.endswith(COMMANDED):
+        is_one = descriptor.shape == (7,)
+        return None if is_one else f"has poses of shape {descriptor.shape}"
+    if descriptor.kind != "keypoints":
+        return "shows no turning; for gloves use `latency` with taps"
+    if descriptor.frame not in {"world", "tracker"}:
+        return "has keypoints in wrist axes, which do not turn with the hand"
+    return None
 
 
 def _camera_turning(

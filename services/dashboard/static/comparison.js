@@ -219,7 +219,7 @@ export class ComparisonPanel {
     find("replay_stop").hidden = view.state !== "running";
     find("drive_pad").hidden = view.state !== "running" || view.episode_id !== "";
     for (const name of document.querySelectorAll(".real_name")) setText(name, view.worlds.real === "recording" ? "Recording" : "Twin");
-    if (view.note) this.say(view.note, view.state === "failed" ? "ERROR" : "WARN");
+    if (view.note || isNew) this.say(view.note, view.state === "failed" ? "ERROR" : "WARN");
     find("compared").hidden = view.pixel_error.length === 0;
     this.charts.show(view);
     this.showMoment();

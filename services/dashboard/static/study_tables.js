@@ -61,7 +61,7 @@ export function rateCell(rate, open) {
   }
   const figures = [element("strong", {}, number(rate.rate, 2)), " ", element("span", { class: "quiet" }, interval(rate.interval)), rateBar(rate.rate, rate.interval)];
   return cell([button(figures, () => open(rate), { class: "cell_link", title: "Show these rollouts" }), ...cautions(rate).map((text) => why(text, "caution")),
-    why(rate.num_disagreements && `${rate.num_disagreements} of ${rate.num_finished} differ from the real outcome`)], ...attributes);
+    why(rate.num_disagreements && `from ${rate.num_disagreements} ${rate.num_disagreements === 1 ? "start" : "starts"} the outcome differs from the real one`)], ...attributes);
 }
 
 function figureCell(one, name, caution = "") {

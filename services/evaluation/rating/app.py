@@ -24,7 +24,7 @@ from dextouch.serving import (
 from services.evaluation.rating import rating_queue
 from services.evaluation.rating.invitations import Invitations, invitation_router
 from services.evaluation.rating.marks import Judgement, Mark, MarkLog, RaterName
-from services.evaluation.rating.rating_report import rating_report
+from services.evaluation.rating.rating_report import check_criteria, rating_report
 from services.evaluation.rating.rubrics import Rubric, read_rubrics, rubric_of
 from services.evaluation.settings import RatingSettings
 
@@ -75,7 +75,10 @@ class SubmittedMarkNumber(FrozenModel):
 
 
 def create_rating_app(settings: RatingSettings) -> FastAPI:
-    """Create the application; raises as `read_rubrics`, `rubric_of`, `rated_rollouts`, MarkLog."""
+    """Create the application.
+
+    Raises as `read_rubrics`, `rubric_of`, `rated_rollouts`, `check_criteria` and `MarkLog`.
+    """
     rubrics = read_rubrics(settings.rubrics)
     tasks = settings.tasks or tuple(rubrics)
     for task in tasks:
@@ -83,6 +86,8 @@ def create_rating_app(settings: RatingSettings) -> FastAPI:
     store = EpisodeStore(settings.store_url).require_folder()
     marks = MarkLog(settings.marks)
     rollouts = rating_queue.rated_rollouts(store, tasks, study=settings.study)
+    task_of = {one.episode_id: one.task for one in rollouts}
+    check_criteria(marks.latest().values(), task_of, rubrics)
     queue = rating_queue.RatingQueue(
         rollouts,
         marks,
@@ -101,7 +106,7 @@ def create_rating_app(settings: RatingSettings) -> FastAPI:
         page,
         rating_router(queue, marks, rubrics, pictures, on_mark=given.inc),
         invitation_router(invitations),
-        agreement_router(marks, rollouts, rubrics, settings.raters_per_rollout),
+        agreement_router(marks, task_of, rubrics, settings.raters_per_rollout),
     ]
     folders = [
         ServedFolder(store.root, "store folder", is_written=False),
@@ -187,14 +192,13 @@ def rating_router(
 
 def agreement_router(
     marks: MarkLog,
-    rollouts: Sequence[rating_queue.RatedRollout],
+    task_of: Mapping[str, str],
     rubrics: Mapping[str, Rubric],
     raters_per_rollout: int,
 ) -> APIRouter:
     """Router of the agreement so far, which raters must not see."""
     leads = Depends(RequireScope("rate_lead"))
     router = APIRouter(prefix="/v1/rating", tags=["rating"], dependencies=[leads])
-    task_of = {one.episode_id: one.task for one in rollouts}
 
     @router.get("/agreement")
     def get_agreement() -> dict[str, Any]:

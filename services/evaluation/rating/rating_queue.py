@@ -116,7 +116,11 @@ class RatingQueue:
             if one.episode_id not in seen
             and raters.get(one.episode_id, 0) < self._raters_per_rollout
         ]
-        tied = [one for one in every if self._decides(rater, given.get(one.episode_id, ()))]
+        tied = [
+            one
+            for one in every
+            if one.episode_id not in seen and self._decides(rater, given.get(one.episode_id, ()))
+        ]
         num_open = len(waiting) + len(tied)
         repeated = self._repeat(rater, mine, seen)
         if repeated is not None:

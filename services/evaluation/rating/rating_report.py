@@ -13,6 +13,7 @@ from typing import Any, Final, Literal
 import numpy as np
 from jaxtyping import Float64
 
+from dextouch.errors import InvalidInputError
 from services.evaluation import statistics
 from services.evaluation.rating.marks import FIRST, REPEAT, Mark, StoredMark, by_people, vote
 from services.evaluation.rating.rubrics import Rubric, rubric_of
@@ -128,6 +129,26 @@ def rater_biases(
     return found
 
 
+def check_criteria(
+    marks: Iterable[StoredMark], task_of: Mapping[str, str], rubrics: Mapping[str, Rubric]
+) -> list[Mark]:
+    """The marks of episodes that have a task; raises InvalidInputError for one by another rubric.
+
+    Marks are never deleted, so that a rubric whose criteria changed needs a file of its own.
+    """
+    known = [one.mark for one in marks if one.mark.episode_id in task_of]
+    for mark in known:
+        task = task_of[mark.episode_id]
+        names = [one.name for one in rubric_of(task, rubrics).criteria]
+        if not mark.cannot_judge and mark.holds.keys() != set(names):
+            raise InvalidInputError(
+                f"mark of {mark.rater!r} for {mark.episode_id!r}: got the criteria "
+                f"{', '.join(mark.holds)}, expected {', '.join(names)} of {task!r}; take the "
+                "rubrics that raters saw, and collect marks by others in another file (--marks)"
+            )
+    return known
+
+
 def rating_report(
     marks: Iterable[StoredMark],
     task_of: Mapping[str, str],
@@ -140,9 +161,10 @@ def rating_report(
 
     Of the marks that count (`MarkLog.latest`), those of programs are listed separately, and those
     of episodes without a task are skipped. `state_scores` are true scores by episode id, where they
-    are known; with fewer than `raters_per_rollout` marks nothing is tied yet.
+    are known; with fewer than `raters_per_rollout` marks nothing is tied yet. Raises as
+    `check_criteria`.
     """
-    known = [one.mark for one in marks if one.mark.episode_id in task_of]
+    known = check_criteria(marks, task_of, rubrics)
     by_episode: dict[str, list[Mark]] = defaultdict(list)
     for mark in known:
         by_episode[mark.episode_id].append(mark)
@@ -214,8 +236,9 @@ def _task(marks: list[Mark], rubric: Rubric) -> dict[str, Any]:
     rollouts = sorted({mark.episode_id for mark in first})
     scores = np.full((len(rollouts), len(raters)), np.nan)
     holds = {one.name: scores.copy() for one in rubric.criteria}
+    row_of, column_of = ({name: i for i, name in enumerate(all_)} for all_ in (rollouts, raters))
     for mark in first:
-        cell = rollouts.index(mark.episode_id), raters.index(mark.rater)
+        cell = row_of[mark.episode_id], column_of[mark.rater]
         scores[cell] = _score(mark, rubric)
         for name, held in mark.holds.items():
             holds[name][cell] = held

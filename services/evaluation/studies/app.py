@@ -12,11 +12,10 @@ from typing import Annotated, Final
 from urllib.parse import quote
 
 from fastapi import APIRouter, Depends, FastAPI, Query, Response
-from pydantic import Field, ValidationError
+from pydantic import Field
 
-from dextouch.errors import CorruptDataError, DexTouchError, NotFoundError
+from dextouch.errors import DexTouchError, NotFoundError
 from dextouch.frozen_model import FrozenModel
-from dextouch.schemas import first_problems
 from dextouch.serving import RequireScope, ServedFolder, create_service_app, serve
 from services.evaluation.reporting.policy_picture import Format
 from services.evaluation.settings import StudyServiceSettings
@@ -132,18 +131,12 @@ class StudyFolders:
         last = self._studies.get(name)
         if last is not None:
             must_wait = began_s < last.until_s and StudyResults.is_running(path.parent)
-            if last.version == version or must_wait:
+            # Results only grow: fewer bytes are another run in the same folder.
+            if last.version == version or (must_wait and last.version[1] <= version[1]):
                 return last
         results = StudyResults.read(path.parent)
-        try:
-            definition = StudyDefinition.model_validate(results.header.definition)
-        except ValidationError as error:
-            raise CorruptDataError(
-                f"study {name!r}: its definition is not one of this version "
-                f"({first_problems(error)})"
-            ) from error
         changed_at = datetime.fromtimestamp(status.st_mtime, UTC)
-        study = _Study(name, version, definition, results, changed_at)
+        study = _Study(name, version, results.definition, results, changed_at)
         study.took(time.monotonic() - began_s)
         self._studies[name] = study
         return study

@@ -216,6 +216,17 @@ class StudyResults:
         self.header = header
         self.outcomes = outcomes
 
+    @property
+    def definition(self) -> StudyDefinition:
+        """What the study compares; raises CorruptDataError if another version wrote it."""
+        try:
+            return StudyDefinition.model_validate(self.header.definition)
+        except ValidationError as error:
+            raise CorruptDataError(
+                f"results {self.path}: the definition is not one of this version "
+                f"({first_problems(error)}); use the version that wrote it"
+            ) from error
+
     @classmethod
     def create_or_resume(cls, folder: Path, header: StudyHeader) -> "StudyResults":
         """Open the results of a study; an incomplete last line of a killed study is removed.

@@ -316,7 +316,7 @@ def write_reports(results: StudyResults, json_path: Path | None) -> dict[str, An
     The figures are those of report.json; they are written to `json_path`, too (`write_result`).
     """
     folder = results.path.parent
-    definition = StudyDefinition.model_validate(results.header.definition)
+    definition = results.definition
     report = study_report(definition, results)
     figures = report.to_report()
     figures["study"] = {"name": definition.name, "digests": results.header.digests}
@@ -361,7 +361,7 @@ def picture_name(world: str, task: str, form: Format) -> str:
 def write_pictures(results: StudyResults) -> None:
     """Write pictures of all imagined worlds and tasks beside the results, in all formats."""
     folder = results.path.parent
-    definition = StudyDefinition.model_validate(results.header.definition)
+    definition = results.definition
     summary = study_summary(folder.name, definition, results, datetime.now(UTC))
     rollouts = study_rollouts(definition, results)
     figures = study_figures(definition, results, rollouts, summary)

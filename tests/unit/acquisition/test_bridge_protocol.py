@@ -268,6 +268,17 @@ def test_a_restarted_source_clock_is_new():
     assert gate.admits(77 + 10 * MS, 10**9 + 70 * MS)
 
 
+@pytest.mark.parametrize(("num_ahead", "ahead_ms"), [(100, 500.0), (1, 900.0)])
+def test_a_clock_that_is_set_back_or_leapt_ahead_once_costs_a_moment(num_ahead, ahead_ms):
+    """As NTP sets it on the source's machine: stamps go on behind those that came before."""
+    gate = FreshnessGate()
+    feed_gate(gate, [1.0] * num_ahead, step_ns=round(ahead_ms * MS))
+    later = range(num_ahead, num_ahead + 200)
+    admitted = [gate.admits(5 * 10**12 + 10 * k * MS, 10**9 + (10 * k + 1) * MS) for k in later]
+    assert not admitted[0]
+    assert all(admitted[25:])
+
+
 def test_the_documented_hello_is_one():
     text = (Path(__file__).parents[3] / "docs" / "device_packets.md").read_text(encoding="utf-8")
     (example,) = re.findall(r"```json\n(.*?)```", text, flags=re.DOTALL)

@@ -374,6 +374,23 @@ def test_a_sign_of_life_is_no_sample_but_ends_the_silence(stage):
     assert stage.driver.statistics.packets == 6
 
 
+def test_a_reader_that_was_held_up_after_its_wait_takes_no_living_bridge_for_lost(
+    stage, monkeypatch
+):
+    stage.driver.open()
+    read = stage.port.transport.read
+
+    def held_up():
+        data = read()
+        stage.pass_time(300 * MS)
+        return data
+
+    monkeypatch.setattr(stage.port.transport, "read", held_up)
+    assert stage.driver.read() == {}
+    stage.port.send(stage.source.units(0, 0, 5)[0])
+    assert list(stage.driver.read()) == ["wrist_left"]
+
+
 def test_samples_that_come_with_the_hello_are_not_lost(stage):
     hello, (unit,) = stage.source.hello, stage.source.units(0, 0, 5)
     stage.port.hello = hello + unit

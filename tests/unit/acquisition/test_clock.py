@@ -1,7 +1,8 @@
 import threading
+import time
 from contextlib import closing
 
-from services.acquisition.clock import StationClock, VirtualClock
+from services.acquisition.clock import HostWatch, StationClock, VirtualClock
 
 
 def run_all(targets):
@@ -76,3 +77,22 @@ def test_real_clock_waits_and_is_cancelled():
     assert clock.now_ns() >= start_ns + 2_000_000
     waiter.cancel()
     assert not waiter.wait_until(clock.now_ns() + 60_000_000_000)
+
+
+def test_a_thread_that_is_held_up_between_two_clocks_has_seen_no_wall_clock_set():
+    class HeldUpClock(StationClock):
+        held_up_ns, num_left = 0, 0
+
+        def read_ns(self, clock_id):
+            now_ns = super().read_ns(clock_id) + self.held_up_ns
+            if clock_id == time.CLOCK_REALTIME and self.num_left:
+                self.num_left -= 1
+                self.held_up_ns += 300_000_000
+            return now_ns
+
+    clock = HeldUpClock()
+    watch = HostWatch(clock)
+    clock.num_left = 1
+    watch.look()
+    watch.look()
+    assert watch.problems() == ()

@@ -113,3 +113,13 @@ def test_a_device_that_begins_anew_is_not_late(rng):
     device_ns[50:] -= device_ns[50]
     found = delays_s(62, 1, t_ns + 20_000_000, device_ns)
     np.testing.assert_allclose(found, 0.0, atol=1e-6)
+
+
+@pytest.mark.parametrize(("bits", "tick_ns", "pause_s"), [(62, 1, 3600), (16, 100_000, 28)])
+def test_a_device_that_paused_is_not_late(rng, bits, tick_ns, pause_s):
+    t_ns, device_ns = camera_stamps(
+        rng, bits=bits, tick_ns=tick_ns, skew=-1e-4, seconds=pause_s + 20
+    )
+    is_on = (t_ns < t_ns[100]) | (t_ns >= t_ns[-100])
+    found = delays_s(bits, tick_ns, t_ns[is_on] + 20_000_000, device_ns[is_on])
+    np.testing.assert_allclose(found, 0.0, atol=0.003)

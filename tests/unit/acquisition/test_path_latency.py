@@ -165,6 +165,19 @@ def test_after_a_step_of_the_devices_clock_the_delay_is_the_same_or_not_told(ste
     assert max(errors) <= 3.0
 
 
+def test_nothing_is_told_of_a_restarted_device_until_it_has_answered_again():
+    """Its old answers and its new stamps belong to different clocks."""
+    glove = SimulatedGlove(3)
+    watched(glove)
+    for _ in range(10):
+        glove.live_a_second()
+    glove.step_ns, glove.is_silent = -1900 * SECOND_NS, True
+    assert [glove.live_a_second() for _ in range(5)] == [None] * 5
+    glove.is_silent = False
+    found = [glove.live_a_second() for _ in range(12)][-1]
+    assert abs(found.latency_ns - glove.latency_ns) <= 3 * found.sigma_ns
+
+
 def test_while_a_stop_of_the_devices_timer_may_be_a_delay_nothing_wrong_is_told():
     """Its stamps go on as if nothing was; one sample is not taken, which is less than the delay."""
     glove = SimulatedGlove(0)

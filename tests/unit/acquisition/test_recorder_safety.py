@@ -144,6 +144,7 @@ def test_a_disk_that_cannot_flush_ends_the_take(make_recorder, clock, monkeypatc
     assert status.state == "checking"
     assert "flush spool 'take'" in status.problems[0]
     assert "error" in status.problems[0]
+    assert "Free space" not in status.check.cause.advice
     assert recorder.save(ANYWAY).state == "saved"
     # How many came in before the flushing thread had its turn depends on the machine.
     assert 10 <= SpoolReader(recorder.spool_root / "take").num_samples("head") < 35
@@ -158,6 +159,7 @@ def test_a_full_disk_ends_the_take_and_it_can_be_saved(make_recorder, clock):
         status = recorder.status()
         assert status.state == "checking"
         assert "no space left" in status.problems[0]
+        assert status.check.cause.advice.startswith("Free space")
         saved = recorder.save(ANYWAY)
     spool = SpoolReader(recorder.spool_root / "take")
     assert spool.closed

@@ -1,7 +1,12 @@
 """The root cause of an ended take: one sentence, one advice, for its gravest problem."""
 
+import pytest
+
 from dextouch.schemas import HealthCause, TakeProblem
-from services.acquisition.take import root_cause
+from dextouch.streams import StreamDescriptor
+from services.acquisition.drivers.packets import DecoderStatistics
+from services.acquisition.supervisor import StreamCounters
+from services.acquisition.take import StreamFacts, root_cause
 
 HUB = HealthCause(
     code="hub",
@@ -52,3 +57,20 @@ def test_errors_lead_and_a_missing_stream_leads_them():
 def test_nothing_is_to_plug_on_a_simulated_device():
     cause = root_cause((problem("head", "missing_stream"),), (), simulated={"head"})
     assert "simulated" in cause.advice
+
+
+@pytest.mark.parametrize(("kind", "rate_hz"), [("scalar", 1.0), ("pose", 4.0), ("image", 1.0)])
+def test_a_slow_stream_has_no_gap_before_it_misses_samples(kind, rate_hz):
+    shape, dtype, unit = ((4, 4, 3), "uint8", "rgb8") if kind == "image" else ((7,), "float64", "1")
+    descriptor = StreamDescriptor(
+        name="slow", kind=kind, shape=shape, dtype=dtype, unit=unit, nominal_rate_hz=rate_hz
+    )
+    period_ns, events = descriptor.period_ns(), vars(DecoderStatistics())
+    count = StreamCounters(10, 0, period_ns, 10 * period_ns, period_ns)
+    whole = StreamFacts(descriptor, count, events, (0, 11 * period_ns))
+    assert not list(whole.problems())
+    count.largest_gap_ns = 4 * period_ns
+    assert [problem.code for problem in whole.problems()] == ["gap"]
+    # A short take may hold a single sample of it.
+    one = StreamCounters(1, 0, period_ns, period_ns, 0)
+    assert not list(StreamFacts(descriptor, one, events, (0, 2 * period_ns)).problems())

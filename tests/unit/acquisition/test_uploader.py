@@ -247,6 +247,29 @@ def refusing(tmp_path):
     return uploader
 
 
+def test_while_the_store_is_away_one_take_at_a_time_is_read_and_each_has_its_turn(
+    tmp_path, monkeypatch
+):
+    """Reading the logs of a day of takes again and again would hold up what is recorded."""
+    for name in "abc":
+        spool(tmp_path, name)
+    scanned, scan = [], SpoolReader.scan
+
+    def counted(self):
+        scanned.append(self.path.name)
+        return scan(self)
+
+    monkeypatch.setattr(SpoolReader, "scan", counted)
+    store = FakeStore()
+    uploader = Uploader(tmp_path, store, period_s=1.0)
+    store.replies_until_failure = 0
+    for _ in range(4):
+        assert uploader.upload_all() == []
+    assert scanned == list("abca")
+    store.replies_until_failure = None
+    assert uploader.upload_all() == list("bca")
+
+
 def test_only_refusals_in_a_row_set_a_take_aside(tmp_path):
     """Three of them, since one may be a passing one; a store that is away refuses nothing."""
     spool(tmp_path)

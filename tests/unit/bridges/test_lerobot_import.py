@@ -246,7 +246,8 @@ def test_datasets_of_others_come_in_by_a_mapping(store, other, folder):
     assert len(readers) == 2
 
 
-def test_actions_come_in_our_order_whatever_that_of_the_file(store, other, folder):
+@pytest.mark.parametrize("state", ["observation.state", "action"])
+def test_actions_come_in_our_order_whatever_that_of_the_file(store, other, folder, state):
     foreign(store, folder)
     order = np.random.default_rng(0).permutation(67)
 
@@ -259,7 +260,8 @@ def test_actions_come_in_our_order_whatever_that_of_the_file(store, other, folde
 
     edit_json(folder, INFO, names)
     edit_column(folder, DATA, "action", values)
-    options = ImportOptions(mapping={"camera_head": "observation.images.top"}, K_head=K_HEAD)
+    mapping = {"camera_head": "observation.images.top", "state": state}
+    options = ImportOptions(mapping=mapping, K_head=K_HEAD)
     (_, second) = import_dataset(folder, other, options=options).ids
     original = make_episode(seed=4, num_steps=21).values["action_commanded"]
     np.testing.assert_allclose(other.open(second).read("action").values, original, atol=1e-6)

@@ -30,13 +30,14 @@ from tests.unit.alignment.tracked_hands import any_rotation, flat_hand, moving_h
 START_NS = 10**12
 
 
-def write_take(path, streams, calibration=None):
+def write_take(path, streams, calibration=None, frames=None):
     """A spooled take; `streams` are name: (kind, unit, times in ns, values)."""
     descriptors = {
         name: StreamDescriptor(
             name=name,
             kind=kind,
             side="left" if kind == "tactile" else None,
+            frame=(frames or {}).get(name),
             shape=values.shape[1:],
             dtype="float64",
             unit=unit,
@@ -222,15 +223,23 @@ def test_times_of_all_that_was_shaken_together(tmp_path, capsys):
         streams[name] = ("pose", "pose_m_wxyz", t_ns, poses)
     hands = keypoints_at_rest(901)
     streams["keypoints_left"] = ("keypoints", "m", np.arange(901) * 11_111_111, hands)
+    # A tracker that was switched off, and one that never saw its target.
+    off = np.zeros((901, 7))
+    streams["object_cup"] = ("pose", "pose_m_wxyz", np.arange(901) * 11_111_111, off)
+    unseen = np.full((901, 25, 3), np.nan)
+    streams["keypoints_right"] = ("keypoints", "m", np.arange(901) * 11_111_111, unseen)
     # The delay of one is known; what is found comes on top of what others are said to have.
     known = {
         "head_latency_ns": ((25e6,),),
         "head_latency_sigma_ns": ((0.2e6,),),
         "wrist_right_latency_ns": ((30e6,),),
     }
-    take = write_take(tmp_path / "shake", streams, known)
+    frames = {"keypoints_right": "world"}
+    take = write_take(tmp_path / "shake", streams, known, frames)
     report, matrices = run("time", "--take", take, to=tmp_path / "to")
     assert report["reference"] == "head"
+    left_out = {"keypoints_left", "keypoints_right", "object_cup"}
+    assert set(report["left_out"]) == left_out
     for name in ("wrist_left", "wrist_right"):
         assert matrices[f"{name}_latency_ns"][0][0] * 1e-6 == pytest.approx(late_ms[name], abs=0.5)
         assert 0.2 <= matrices[f"{name}_latency_sigma_ns"][0][0] * 1e-6 <= 0.6

@@ -15,8 +15,8 @@ from packaging.utils import canonicalize_name
 from services.cli.extras import EXTRA_OF, missing_package
 
 ROOT = Path(__file__).parents[3]
-# Runs every line of standard input as a command, in an environment without some packages.
-CHILD = """
+# An environment without the packages of the command line.
+WITHOUT = """
 import contextlib, io, json, sys
 
 class Without:
@@ -29,9 +29,12 @@ class Without:
         return None if absent else self.finder.find_spec(name, path, target)
 
 sys.meta_path[:] = [Without(finder) for finder in sys.meta_path]
+"""
+# Runs every line of standard input as a command.
+CHILD = f"""{WITHOUT}
 from services.cli import main
 
-answers = {}
+answers = {{}}
 for line in sys.stdin.read().splitlines():
     err = io.StringIO()
     with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(err):
@@ -63,7 +66,7 @@ COMMANDS = (
     "train judge",
     "serve",
     "evaluate",
-    "rate serve",
+    "rate serve --help",
     "rate report",
 )
 HELP = "\n".join(("--help", "train --help", *COMMANDS))
@@ -83,6 +86,20 @@ def run_without(folder, packages, lines):
     )
     assert child.returncode == 0, child.stderr[-2000:]
     return json.loads(child.stdout)
+
+
+def test_services_of_the_light_image_need_no_more_than_its_extras():
+    dockerfile = (ROOT / "deploy/Dockerfile").read_text()
+    installed = re.search(r"'\.\[(.*?)\]'", dockerfile)[1].split(",")
+    absent = [package for package, extra in EXTRA_OF.items() if extra not in installed]
+    assert {"torch", "pyarrow"} <= set(absent)
+    folders = ("acquisition", "alignment", "dashboard", "episode_store", "evaluation.studies")
+    apps = [*(f"services.{folder}.app" for folder in folders), "services.twin.world"]
+    code = f"{WITHOUT}import {', '.join(apps)}"
+    done = subprocess.run(
+        [sys.executable, "-c", code, *absent], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr[-1000:]
 
 
 @pytest.mark.long
@@ -107,8 +124,6 @@ def run_without(folder, packages, lines):
                 "train judge",
                 "serve",
                 "evaluate",
-                "rate serve",
-                "rate report",
             },
         ),
         (
@@ -122,8 +137,6 @@ def run_without(folder, packages, lines):
                 "train judge",
                 "serve",
                 "evaluate",
-                "rate serve",
-                "rate report",
             },
         ),
     ],

@@ -9,11 +9,12 @@ import pytest
 from dextouch.clients import RolloutClient
 from dextouch.command_line import positive
 from dextouch.episodes import EpisodeStore
-from dextouch.errors import NotFoundError
-from dextouch.schemas import LineageEntry
+from dextouch.errors import EndedError, NotFoundError
+from dextouch.schemas import EVERYTHING, LineageEntry
 from dextouch.worlds import WorldServiceSettings, create_world_app
 from services.evaluation.endings import read_ending_episode
 from services.generation import imagine_episode
+from services.pipelines import imagined_data
 from services.pipelines.imagined_data import (
     WORLD,
     _picture,
@@ -55,6 +56,32 @@ def checkpoint(tmp_path_factory):
     loaded = untrained_state_checkpoint()
     write_state_checkpoint(path, loaded.dynamics, loaded.renderer, loaded.metadata)
     return path
+
+
+class EndingWorld(toy.ToyWorld):
+    """Cannot continue the rollout of one seed."""
+
+    def step(self, state, actions, *, seed, selector=EVERYTHING):
+        if state.step >= 48 and np.array_equal(state.target, toy.target_m("reach", 2)):
+            raise EndedError("dream: lost", reason="hands moved too long")
+        return super().step(state, actions, seed=seed, selector=selector)
+
+
+def test_an_episode_that_a_world_cannot_finish_does_not_keep_the_others_back(
+    tmp_path, monkeypatch, capsys
+):
+    store, target = EpisodeStore(tmp_path / "true"), tmp_path / "imagined"
+    for seed in (1, 2, 3):
+        toy_store.write(store, toy.demonstration("reach", seed))
+    world = EndingWorld("dream", judge=False)
+    monkeypatch.setattr(imagined_data, "open_world", lambda _: world)
+    flags = {"episodes": str(store.root), "output": str(target), "checkpoint": tmp_path}
+    made = imagined_data.imagine_all(store.list(), **flags)
+    assert len(made) == 2
+    assert EpisodeStore(target).list() == sorted(made)
+    told = capsys.readouterr().err
+    assert "reach-2-0" in told
+    assert "hands moved too long" in told
 
 
 def test_judged_steps_are_three_at_every_end(truth):

@@ -4,6 +4,7 @@ import json
 import sqlite3
 import threading
 from datetime import datetime
+from random import Random
 
 import pytest
 from pydantic import ValidationError
@@ -16,6 +17,7 @@ from dextouch.schemas import Review
 from services.episode_store import catalog_index
 from services.episode_store.app import PeriodicThread
 from services.episode_store.catalog import Catalog
+from services.episode_store.catalog_file import CatalogFile
 from services.episode_store.filters import EpisodeFilter, ItemFilter, Page
 from tests.unit.episode_store.random_items import NOON, put_item
 
@@ -219,3 +221,33 @@ def test_pages_go_on_after_an_id(store, sort, descending):
             one = catalog.items(query, limit=1, page=Page(**page, after=after))
             paged, after = [*paged, one.items[0].id], one.next_after
         assert (paged, after) == (found, None)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_what_others_change_is_listed_as_by_a_new_catalog(store, monkeypatch, seed):
+    monkeypatch.setattr(catalog_index, "ALWAYS_CHECKED", 0)
+    catalog, other, chance = Catalog(store), EpisodeStore(store.url), Random(seed)
+    trashed = []
+    for number in range(12):
+        there = other.list()
+        change = chance.choice(("commit", "delete", "restore", "replace", "rename"))
+        if change == "restore" and trashed:
+            other.restore(trashed.pop())
+        elif change in ("commit", "restore") or len(there) < 2:
+            put_item(other, "episode", f"new-{number}", task=f"task-{number % 3}")
+        elif change == "rename":
+            folder = other.root / "episodes" / chance.choice(there)
+            folder.rename(folder.with_name(f"moved-{number}"))
+        else:
+            name = chance.choice(there)
+            other.delete(name, for_good=change == "replace")
+            if change == "replace":
+                put_item(other, "episode", name, task="replaced")
+            else:
+                trashed.append(name)
+        with monkeypatch.context() as alone:
+            # In memory, so that it takes no row over from the file.
+            alone.setattr(CatalogFile, "_open_file", lambda _: sqlite3.connect("/none/none"))
+            fresh = Catalog(other)
+            expected = fresh.items(ItemFilter(), limit=99), fresh.hours(EpisodeFilter())
+        assert (catalog.items(ItemFilter(), limit=99), catalog.hours(EpisodeFilter())) == expected

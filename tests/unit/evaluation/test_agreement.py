@@ -1,5 +1,6 @@
 """Agreement figures against scipy, hand calculations, brute force and simulated studies."""
 
+import itertools
 import math
 import tracemalloc
 
@@ -100,9 +101,31 @@ def test_sign_flips_are_those_of_scipy(num_starts):
     assert sign_flip_p(np.zeros(5), rng()) == 1.0
 
 
+def test_sign_flips_of_outcomes_are_the_exact_binomial_test():
+    outcomes = binary([0.5, 0.42], 2000, rng(9))
+    paired = outcomes[0] - outcomes[1]
+    oracle = stats.binomtest(int((paired > 0).sum()), int((paired != 0).sum()))
+    tracemalloc.start()
+    found = sign_flip_p(paired, rng())
+    _, peak_bytes = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert found == pytest.approx(oracle.pvalue, rel=1e-9)
+    # Signs of each start would be 400 MB.
+    assert peak_bytes < 10e6
+
+
+def test_sign_flips_of_shares_are_those_of_all_patterns():
+    # 1/3 in four ways that differ by rounding: 2^12 patterns by brute force.
+    paired = np.array([1, 2 / 3 - 1 / 3, 1 - 2 / 3, 1 / 3, 4 / 3 - 1, -2 / 3] * 2)
+    signs = np.array(list(itertools.product((-1.0, 1.0), repeat=len(paired))))
+    expected = np.mean(np.abs(signs @ paired) >= abs(paired.sum()) - 1e-9)
+    assert sign_flip_p(paired, rng()) == pytest.approx(expected, rel=1e-9)
+
+
 def test_a_p_value_of_drawn_signs_is_never_zero():
     """Of 2^60 sign patterns none that is drawn is as large as the true one, which counts."""
-    assert sign_flip_p(np.ones(60), rng()) == pytest.approx(1 / (MAX_PERMUTATIONS + 1))
+    found = sign_flip_p(np.linspace(1.0, 2.0, 60), rng())
+    assert found == pytest.approx(1 / (MAX_PERMUTATIONS + 1))
 
 
 def test_paired_difference_by_hand():

@@ -12,7 +12,7 @@ from dextouch.episodes import EpisodeStore
 from dextouch.errors import InvalidInputError, UnknownNameError
 from services.cli.main import main
 from services.evaluation.rating.app import create_rating_app
-from services.evaluation.rating.marks import MarkLog
+from services.evaluation.rating.marks import Mark, MarkLog
 from services.evaluation.rating.rating_queue import rated_rollouts, side_by_side
 from services.evaluation.settings import RatingSettings
 from tests.unit.evaluation import toy
@@ -85,6 +85,26 @@ async def test_a_rater_rates_everything_without_learning_what_it_is(settings, tm
     report = json.loads(path.read_text())
     assert [row["score"] for row in report["rollouts"]] == [pytest.approx(2 / 3)] * 2
     assert "reach: score 0.67 over 2 rollouts, 1 raters" in capsys.readouterr().out
+
+
+def test_marks_by_another_rubric_are_refused_before_more_are_given(settings, capsys):
+    holds = {"touched": True, "stayed": False}
+    log, name = MarkLog(settings["marks"]), "imagined-dream-1"
+    log.add(Mark(rater="ada", episode_id=name, holds=holds))
+    log.add(Mark(rater="ada", episode_id="of-another-pool", holds={"other": True}))
+    create_rating_app(RatingSettings(**settings))
+    settings["rubrics"].write_text(RUBRICS.replace('"stayed"', '"rested"'))
+    expected = "mark of 'ada' for 'imagined-dream-1': got the criteria touched, stayed, expected "
+    with pytest.raises(InvalidInputError, match=f"{expected}touched, rested"):
+        create_rating_app(RatingSettings(**settings))
+    flags = [f"--{key.replace('_', '-')}={value}" for key, value in settings.items()]
+    assert main(["rate", "report", *flags]) == 3
+    message = capsys.readouterr().err
+    assert expected in message
+    assert "in another file (--marks)" in message
+    # Whoever could not judge a rollout said nothing of any criterion.
+    log.add(Mark(rater="ada", episode_id=name, cannot_judge=True))
+    create_rating_app(RatingSettings(**settings))
 
 
 @pytest.mark.parametrize("missing", ["store_url", "marks"])

@@ -143,6 +143,18 @@ def test_automatic_marks_do_not_take_a_person_s_place(log):
     assert len(rate_all(queue, log, "ada")) == 12
 
 
+def test_a_program_sees_a_tie_of_people_once(log):
+    for rater, stands in (("ada", True), ("bob", False)):
+        for name in IDS[:3]:
+            log.add(mark(rater, name, standing=stands))
+    queue = RatingQueue(rollouts(IDS[:3]), log, raters_per_rollout=2, repeat_share=0.0)
+    shown = []
+    while (assigned := queue.next("probe")) is not None and len(shown) < 6:
+        shown.append(assigned.rollout.episode_id)
+        log.add(mark("probe", shown[-1], kind="auto", presentation=assigned.presentation))
+    assert sorted(shown) == IDS[:3]
+
+
 def test_the_report_by_hand(log):
     for rater in ("ada", "bob"):
         for name in IDS[:4]:

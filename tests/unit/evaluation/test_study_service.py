@@ -1,12 +1,14 @@
 """The service of studies: figures against scipy and plain loops, progress, keys, unknown names."""
 
 import fcntl
+import json
 import os
 import shutil
 
 import httpx
 import pytest
 
+from services.cli.main import main
 from services.evaluation.settings import StudyServiceSettings
 from services.evaluation.studies import app
 from services.evaluation.studies.app import create_app
@@ -189,6 +191,31 @@ async def test_a_running_study_is_read_again_only_now_and_then(tmp_path, monkeyp
             assert await num_done() == 96
         # Once it has ended, at once.
         assert await num_done() == 143
+
+
+async def test_a_new_run_in_place_of_a_finished_one_is_read_at_once(tmp_path, monkeypatch):
+    monkeypatch.setattr(app, "MAX_READING_SHARE", 1e-6)
+    write_study(tmp_path / "touch")
+    async with client(tmp_path) as opened:
+        assert (await opened.get("/v1/studies")).json()["studies"][0]["num_done"] == 143
+        shutil.rmtree(tmp_path / "touch")
+        path = write_study(tmp_path / "touch", unfinished=WORLDS)
+        with path.open("rb") as running:
+            fcntl.flock(running, fcntl.LOCK_EX)
+            (one,) = (await opened.get("/v1/studies")).json()["studies"]
+    assert (one["num_done"], one["is_running"]) == (0, True)
+
+
+async def test_a_study_of_another_version_is_told(root, capsys):
+    path = root / "touch" / "results.jsonl"
+    header, *rows = path.read_text().splitlines(keepends=True)
+    changed = json.loads(header) | {"definition": DEFINITION | {"shuffled": True}}
+    path.write_text("".join([json.dumps(changed) + "\n", *rows]))
+    expected = "the definition is not one of this version (shuffled: "
+    (one,) = (await read(root, "/v1/studies"))["studies"]
+    assert expected in one["problem"]
+    assert main(["study", "report", str(root / "touch")]) == 3
+    assert expected in capsys.readouterr().err
 
 
 async def test_damaged_studies_are_listed_with_the_reason(root):

@@ -180,10 +180,12 @@ document.addEventListener("keydown", (event) => {
   if (!shown || isTyped || event.ctrlKey || event.metaKey || event.altKey) return;
   const action = actionOf(event);
   const criterion = shown.criteria[action - 1];
-  if (criterion) set(criterion.name, !marks[criterion.name]);
-  else if (!BY_KEY[action]) return;
-  else BY_KEY[action]();
+  if (!criterion && !BY_KEY[action]) return;
   event.preventDefault();
+  // Held down, other keys than those of steps would answer for one rollout after another.
+  if (event.repeat && action !== "back" && action !== "forward") return;
+  if (criterion) set(criterion.name, !marks[criterion.name]);
+  else BY_KEY[action]();
 });
 enterByLink();
 requestAnimationFrame(tick);

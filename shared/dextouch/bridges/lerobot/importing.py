@@ -428,7 +428,7 @@ def _columns(
             )
         wanted.append(name)
     columns, ours = source.columns(entry, wanted), tuple(action_names())
-    for name in (features[role] for role in ("action", "state") if role in features):
+    for name in {features[role] for role in ("action", "state") if role in features}:
         names = source.info.features[name].component_names()
         if names != ours and sorted(names) == sorted(ours):
             columns[name] = columns[name][:, [names.index(one) for one in ours]]

@@ -15,7 +15,7 @@ import pytest
 from dextouch.episodes.spool import SpoolReader
 from dextouch.errors import DeviceError, InvalidInputError, UnavailableError
 from services.acquisition.app import create_app
-from services.acquisition.clock import StationClock
+from services.acquisition.clock import StationClock, station_offset_ns
 from services.acquisition.drivers.sdk_link import BridgedDevice, parse_hello
 from services.acquisition.sdk_bridges import bridge as bridge_module
 from services.acquisition.sdk_bridges.bridge import (
@@ -30,7 +30,6 @@ from services.acquisition.sdk_bridges.bridge import (
     hello,
     pose_reading,
     run_bridge,
-    station_offset_ns,
 )
 from services.acquisition.settings import AcquisitionSettings
 
