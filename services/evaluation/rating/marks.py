@@ -149,13 +149,13 @@ class MarkLog:
             for number, at, text in rows
         ]
 
-    def latest(self) -> Mapping[tuple[str, str, int], StoredMark]:
-        """The mark that counts for every (rater, episode id, presentation), oldest first."""
-        newest: dict[tuple[str, str, int], StoredMark] = {}
+    def latest(self) -> list[StoredMark]:
+        """The mark that counts of every rater, kind, episode and presentation, oldest first."""
+        newest: dict[tuple[str, str, str, int], StoredMark] = {}
         for stored in self.history():
             mark = stored.mark
-            newest[mark.rater, mark.episode_id, mark.presentation] = stored
-        return newest
+            newest[mark.rater, mark.kind, mark.episode_id, mark.presentation] = stored
+        return list(newest.values())
 
     @contextmanager
     def connected(self, done: str) -> Iterator[sqlite3.Connection]:
