@@ -1,6 +1,5 @@
 """Marks that raters gave to rollouts, kept in an append-only SQLite file."""
 
-import json
 import sqlite3
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
@@ -145,7 +144,7 @@ class MarkLog:
                 "SELECT number, rated_at, content FROM marks ORDER BY number"
             ).fetchall()
         return [
-            StoredMark(number, datetime.fromisoformat(at), Mark.model_validate(json.loads(text)))
+            StoredMark(number, datetime.fromisoformat(at), Mark.model_validate_json(text))
             for number, at, text in rows
         ]
 
