@@ -64,8 +64,7 @@ class Figure:
     undefined_share: float
 
 
-@dataclass(frozen=True)
-class Draws:
+class Draws(NamedTuple):
     """Draws of one task's scores: from the posterior, for intervals, and of the bootstrap."""
 
     posterior: ScoreDraws
@@ -128,11 +127,8 @@ def pooled_agreement(
     imagined = np.array([known_mean(scores.imagined, axis=1) for scores in tasks])
     joined = Draws(
         *(
-            ScoreDraws(
-                np.concatenate([one.real for one in kind], axis=1),
-                np.concatenate([one.imagined for one in kind], axis=1),
-            )
-            for kind in ([one.posterior for one in draws], [one.bootstrap for one in draws])
+            ScoreDraws(*(np.concatenate(side, axis=1) for side in zip(*kind, strict=True)))
+            for kind in zip(*draws, strict=True)
         )
     )
     without = {

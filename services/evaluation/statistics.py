@@ -8,7 +8,7 @@ intervals (`python -m benchmarks agreement`). `bootstrap_scores` shows how often
 import math
 from dataclasses import dataclass
 from statistics import NormalDist
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
@@ -172,8 +172,7 @@ def known_mean(scores: np.ndarray, *, axis: int) -> np.ndarray:
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
-@dataclass(frozen=True)
-class MatchedScores:
+class MatchedScores(NamedTuple):
     """Scores in 0 … 1 of one task's policies from the same starts in two worlds.
 
     Success is 0 or 1. An imagined rollout that is NaN is undecided and counts in no mean; every
@@ -184,8 +183,7 @@ class MatchedScores:
     imagined: Float64[np.ndarray, "policies starts"]
 
 
-@dataclass(frozen=True)
-class ScoreDraws:
+class ScoreDraws(NamedTuple):
     """Plausible mean scores [draws, policies] of the same policies in two worlds."""
 
     real: Float64[np.ndarray, "draws policies"]

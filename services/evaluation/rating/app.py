@@ -87,7 +87,7 @@ def create_rating_app(settings: RatingSettings) -> FastAPI:
     marks = MarkLog(settings.marks)
     rollouts = rating_queue.rated_rollouts(store, tasks, study=settings.study)
     task_of = {one.episode_id: one.task for one in rollouts}
-    check_criteria(marks.latest().values(), task_of, rubrics)
+    check_criteria(marks.latest(), task_of, rubrics)
     queue = rating_queue.RatingQueue(
         rollouts,
         marks,
@@ -203,7 +203,7 @@ def agreement_router(
     @router.get("/agreement")
     def get_agreement() -> dict[str, Any]:
         """The report of all marks until now without single rollouts, with the rollouts by task."""
-        given = marks.latest().values()
+        given = marks.latest()
         report = rating_report(given, task_of, rubrics, {}, raters_per_rollout=raters_per_rollout)
         return report | {"rollouts": dict(Counts(task_of.values()))}
 

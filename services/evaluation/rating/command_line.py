@@ -22,7 +22,7 @@ def report_main(argv: Sequence[str]) -> int:
     rubrics = read_rubrics(settings.rubrics)
     store = EpisodeStore(settings.store_url).require_folder()
     rollouts = rated_rollouts(store, tuple(rubrics), study=settings.study)
-    marks = MarkLog(settings.marks).latest().values()
+    marks = MarkLog(settings.marks).latest()
     tasks = {one.episode_id: one.task for one in rollouts}
     report = rating_report(marks, tasks, rubrics, state_scores(store, rollouts, rubrics))
     write_result(settings.json_path, report, allow_nan=False)

@@ -1,6 +1,5 @@
 """Marks that raters gave to rollouts, kept in an append-only SQLite file."""
 
-import json
 import sqlite3
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
@@ -145,17 +144,17 @@ class MarkLog:
                 "SELECT number, rated_at, content FROM marks ORDER BY number"
             ).fetchall()
         return [
-            StoredMark(number, datetime.fromisoformat(at), Mark.model_validate(json.loads(text)))
+            StoredMark(number, datetime.fromisoformat(at), Mark.model_validate_json(text))
             for number, at, text in rows
         ]
 
-    def latest(self) -> Mapping[tuple[str, str, int], StoredMark]:
-        """The mark that counts for every (rater, episode id, presentation), oldest first."""
-        newest: dict[tuple[str, str, int], StoredMark] = {}
+    def latest(self) -> list[StoredMark]:
+        """The mark that counts of every rater, kind, episode and presentation, oldest first."""
+        newest: dict[tuple[str, str, str, int], StoredMark] = {}
         for stored in self.history():
             mark = stored.mark
-            newest[mark.rater, mark.episode_id, mark.presentation] = stored
-        return newest
+            newest[mark.rater, mark.kind, mark.episode_id, mark.presentation] = stored
+        return list(newest.values())
 
     @contextmanager
     def connected(self, done: str) -> Iterator[sqlite3.Connection]:

@@ -98,14 +98,14 @@ class RatingQueue:
         """The rollout that a rater should rate next; None when nothing is left."""
         latest = self._marks.latest()
         mine = sorted(
-            (stored for (who, _, _), stored in latest.items() if who == rater),
+            (stored for stored in latest if stored.mark.rater == rater),
             key=lambda stored: stored.number,
         )
         every = self._rollouts.values()
         # The file may hold marks of other rollouts, too.
         seen = {one.mark.episode_id for one in mine if one.mark.presentation != REPEAT}
         seen &= {one.episode_id for one in every}
-        given = by_people(stored.mark for stored in latest.values())
+        given = by_people(stored.mark for stored in latest)
         raters = {
             episode_id: sum(one.presentation == FIRST for one in marks)
             for episode_id, marks in given.items()
@@ -138,7 +138,7 @@ class RatingQueue:
 
         Raises ConflictError if its presentation is not that of the rater's assignment.
         """
-        latest = (stored.mark for stored in self._marks.latest().values())
+        latest = (stored.mark for stored in self._marks.latest())
         given = [one for one in latest if one.episode_id == mark.episode_id]
         first = [one for one in given if (one.presentation, one.kind) == (FIRST, "human")]
         deciders = {one.rater for one in given if one.presentation == DECIDING}

@@ -19,7 +19,7 @@ from dextouch.frozen_model import FrozenModel
 from dextouch.serving import RequireScope, ServedFolder, create_service_app, serve
 from services.evaluation.reporting.policy_picture import Format
 from services.evaluation.settings import StudyServiceSettings
-from services.evaluation.studies.results import FILE, NAME_PATTERN, StudyDefinition, StudyResults
+from services.evaluation.studies.results import FILE, NAME_PATTERN, StudyResults
 from services.evaluation.studies.study_figures import (
     StudyFigures,
     StudyRollout,
@@ -48,7 +48,6 @@ class _Study:
 
     name: str
     version: tuple[int, int]
-    definition: StudyDefinition
     results: StudyResults
     changed_at: datetime
     took_s: float = 0.0
@@ -61,15 +60,15 @@ class _Study:
 
     @property
     def summary(self) -> StudySummary:
-        return study_summary(self.name, self.definition, self.results, self.changed_at)
+        return study_summary(self.name, self.results, self.changed_at)
 
     @cached_property
     def rollouts(self) -> tuple[StudyRollout, ...]:
-        return study_rollouts(self.definition, self.results)
+        return study_rollouts(self.results)
 
     @cached_property
     def figures(self) -> StudyFigures:
-        return study_figures(self.definition, self.results, self.rollouts, self.summary)
+        return study_figures(self.results, self.rollouts, self.summary)
 
 
 class StudyFolders:
@@ -136,7 +135,7 @@ class StudyFolders:
                 return last
         results = StudyResults.read(path.parent)
         changed_at = datetime.fromtimestamp(status.st_mtime, UTC)
-        study = _Study(name, version, results.definition, results, changed_at)
+        study = _Study(name, version, results, changed_at)
         study.took(time.monotonic() - began_s)
         self._studies[name] = study
         return study

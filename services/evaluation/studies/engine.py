@@ -3,7 +3,7 @@
 import hashlib
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from contextlib import ExitStack
 from copy import copy
 from dataclasses import dataclass, field
@@ -159,14 +159,12 @@ class _Workers:
                 pools.callback(pool.shutdown, cancel_futures=True)
                 pending |= {pool.submit(self._outcome, planned) for planned in own}
             try:
-                while pending:
-                    done, pending = wait(pending, return_when=FIRST_COMPLETED)
-                    for future in done:
-                        outcome = future.result()
-                        if outcome is not None:
-                            keep(outcome)
-                            num_failed += isinstance(outcome, RolloutFailure)
-                            progress.advance(failed=float(num_failed))
+                for future in as_completed(pending):
+                    outcome = future.result()
+                    if outcome is not None:
+                        keep(outcome)
+                        num_failed += isinstance(outcome, RolloutFailure)
+                        progress.advance(failed=float(num_failed))
             finally:
                 # After an error or Ctrl-C, threads end with their current rollout.
                 self._stopping.set()

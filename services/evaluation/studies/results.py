@@ -13,6 +13,7 @@ import tomllib
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, NamedTuple
 
@@ -216,7 +217,7 @@ class StudyResults:
         self.header = header
         self.outcomes = outcomes
 
-    @property
+    @cached_property
     def definition(self) -> StudyDefinition:
         """What the study compares; raises CorruptDataError if another version wrote it."""
         try:

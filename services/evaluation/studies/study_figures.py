@@ -40,7 +40,6 @@ from services.evaluation.scores import (
 from services.evaluation.studies.results import (
     KEPT_FOLDER,
     PlannedRollout,
-    StudyDefinition,
     StudyResults,
     planned_rollout_of,
     planned_rollouts_of,
@@ -150,11 +149,9 @@ class StudyFigures(FrozenModel):
     meanings: dict[str, str] = MEANINGS
 
 
-def study_summary(
-    name: str, definition: StudyDefinition, results: StudyResults, changed_at: datetime
-) -> StudySummary:
+def study_summary(name: str, results: StudyResults, changed_at: datetime) -> StudySummary:
     """What the list of studies shows of one whose results can be read."""
-    outcomes = results.outcomes.values()
+    definition, outcomes = results.definition, results.outcomes.values()
     return StudySummary(
         name=name,
         title=definition.name,
@@ -168,8 +165,9 @@ def study_summary(
     )
 
 
-def study_rollouts(definition: StudyDefinition, results: StudyResults) -> tuple[StudyRollout, ...]:
+def study_rollouts(results: StudyResults) -> tuple[StudyRollout, ...]:
     """All rollouts with a result, those first that disagree with the real world most."""
+    definition = results.definition
     real = {
         (planned.task, planned.seed, planned.policy): outcome.success
         for planned, outcome in results.outcomes.items()
@@ -218,15 +216,12 @@ def _rollout(
 
 
 def study_figures(
-    definition: StudyDefinition,
-    results: StudyResults,
-    rollouts: tuple[StudyRollout, ...],
-    summary: StudySummary,
+    results: StudyResults, rollouts: tuple[StudyRollout, ...], summary: StudySummary
 ) -> StudyFigures:
     """Rates and agreement, with the intervals of `ClosedLoopReport`."""
-    report = study_report(definition, results)
+    report = study_report(results.definition, results)
     rates = tuple(_rates(report, rollouts))
-    agreement = [one for world in definition.imagined for one in _agreement(report, world)]
+    agreement = [one for world in report.imagined_worlds for one in _agreement(report, world)]
     return StudyFigures(
         summary=summary,
         rates=rates,
@@ -361,10 +356,8 @@ def picture_name(world: str, task: str, form: Format) -> str:
 def write_pictures(results: StudyResults) -> None:
     """Write pictures of all imagined worlds and tasks beside the results, in all formats."""
     folder = results.path.parent
-    definition = results.definition
-    summary = study_summary(folder.name, definition, results, datetime.now(UTC))
-    rollouts = study_rollouts(definition, results)
-    figures = study_figures(definition, results, rollouts, summary)
+    summary = study_summary(folder.name, results, datetime.now(UTC))
+    figures = study_figures(results, study_rollouts(results), summary)
     for world in figures.summary.worlds:
         for task in (*figures.summary.tasks, *([""] * (len(figures.summary.tasks) > 1))):
             for form in get_args(Format):

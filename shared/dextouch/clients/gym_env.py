@@ -48,12 +48,12 @@ class WorldEnv(gymnasium.Env[SeenNow, np.ndarray]):
     """One task in one served world; an action is `chunk_steps` model steps.
 
     The observation is that of the newest step: `tactile_kpa` [2, taxels], `action_reached` [67] and
-    one image a camera. The reward is 1 on the chunk that ends in success, else 0; success ends the
-    episode, `max_chunks` truncates it. A world without a success check never terminates. A world
-    that cannot continue a rollout truncates it: the observation is then the last one again, and
-    `info["ended"]` says why (None otherwise). `info` also holds `success` (None where unknown),
-    `uncertainty` of the chunk, `rollout_uncertainty` of all chunks so far, and the numbers that the
-    world reports about the chunk.
+    one image a camera that the client selects. The reward is 1 on the chunk that ends in success,
+    else 0; success ends the episode, `max_chunks` truncates it. A world without a success check
+    never terminates. A world that cannot continue a rollout truncates it: the observation is then
+    the last one again, and `info["ended"]` says why (None otherwise). `info` also holds `success`
+    (None where unknown), `uncertainty` of the chunk, `rollout_uncertainty` of all chunks so far,
+    and the numbers that the world reports about the chunk.
 
     With the render mode `rgb_array`, `render` returns the newest image of each camera side by side,
     [h, w, 3]; with `rgb_array_list`, all of the newest chunk, and none the second time.
@@ -85,6 +85,8 @@ class WorldEnv(gymnasium.Env[SeenNow, np.ndarray]):
         if world not in described:
             raise UnknownNameError("world", world, list(described))
         self.description = described[world]
+        chosen = client.selector.cameras
+        self._cameras = self.description.cameras if chosen is None else tuple(dict.fromkeys(chosen))
         if chunk_steps < 1 or chunk_steps % self.description.chunk_multiple:
             raise InvalidInputError(
                 f"chunk_steps: got {chunk_steps}, expected a positive multiple of "
@@ -93,14 +95,14 @@ class WorldEnv(gymnasium.Env[SeenNow, np.ndarray]):
         modes = self.metadata["render_modes"]
         if render_mode is not None and render_mode not in modes:
             raise UnknownNameError("render mode", render_mode, modes)
-        if render_mode is not None and not self.description.cameras:
+        if render_mode is not None and not self._cameras:
             raise InvalidInputError(f"render_mode: world {world} has no camera, expected None")
         self.render_mode = render_mode
         rate_hz = self.description.model_rate_hz
         per_image = 1 if render_mode == "rgb_array_list" else chunk_steps
         self.metadata = {**self.metadata, "render_fps": rate_hz / per_image}
         self._rendered: Observation | None = None
-        self.observation_space = _observation_space(self.description)
+        self.observation_space = _observation_space(self.description, self._cameras)
         self.action_space = _action_space(chunk_steps)
 
     def reset(
@@ -147,7 +149,7 @@ class WorldEnv(gymnasium.Env[SeenNow, np.ndarray]):
         if self._rollout is None:
             raise InvalidInputError("render: there is no episode; call reset first")
         seen = self._rollout.observation
-        images = np.concatenate([seen.images[name] for name in self.description.cameras], axis=2)
+        images = np.concatenate([seen.images[name] for name in self._cameras], axis=2)
         if self.render_mode == "rgb_array":
             return images[-1]
         is_rendered, self._rendered = seen is self._rendered, seen
@@ -345,10 +347,12 @@ class WorldVectorEnv(VectorEnv[SeenNow, np.ndarray, np.ndarray]):
         return dict(concatenate(self.single_observation_space, self._seen, empty))
 
 
-def _observation_space(description: WorldDescription) -> spaces.Space[SeenNow]:
+def _observation_space(
+    description: WorldDescription, cameras: Sequence[str]
+) -> spaces.Space[SeenNow]:
     shape = (description.image_height_px, description.image_width_px, 3)
     parts: dict[str, spaces.Space[Any]] = {
-        camera: spaces.Box(0, 255, shape, np.uint8) for camera in description.cameras
+        camera: spaces.Box(0, 255, shape, np.uint8) for camera in cameras
     }
     touch = (2, description.num_taxels)
     parts["tactile_kpa"] = spaces.Box(-MAX_TACTILE_KPA, MAX_TACTILE_KPA, touch, np.float32)

@@ -19,6 +19,7 @@ from gymnasium.wrappers.vector import DictInfoToList, RecordEpisodeStatistics
 from dextouch.clients import RolloutClient
 from dextouch.clients.gym_env import ENV_ID, RolloutEnv, WorldEnv, WorldVectorEnv, make_vector
 from dextouch.errors import InvalidInputError, UnavailableError, UnknownNameError
+from dextouch.schemas import ReturnSelector
 from dextouch.worlds import CopyFirstWorld, WorldServiceSettings, create_world_app
 from tests.unit.worlds.fakes import K_HEAD, SumWorld, actions, anchor, observation
 from tests.unit.worlds.running import served
@@ -97,6 +98,22 @@ def test_gymnasium_makes_it_by_name_and_accepts_its_images(made):
         env.render(), np.concatenate([seen[name] for name in cameras], axis=1)
     )
     assert env.metadata["render_fps"] == 15 / 4
+
+
+@pytest.mark.parametrize("cameras", [("camera_wrist_left",), ()])
+def test_observations_are_of_the_cameras_that_the_client_selects(client, cameras):
+    few = client.selecting(ReturnSelector(cameras=cameras, steps="last"))
+    mode = "rgb_array" if cameras else None
+    env = WorldEnv(few, world="sum", chunk_steps=4, max_chunks=3, render_mode=mode, **ASKED)
+    check_env(env, skip_render_check=True)
+    seen, _ = env.reset(seed=3)
+    assert {*seen} == {*cameras, "tactile_kpa", "action_reached"}
+    if cameras:
+        np.testing.assert_array_equal(env.render(), seen[cameras[0]])
+    else:
+        with pytest.raises(InvalidInputError, match="has no camera"):
+            WorldEnv(few, world="sum", render_mode="rgb_array", **ASKED)
+    env.close()
 
 
 def test_a_list_has_every_step_of_the_chunk_once(made):

@@ -45,7 +45,7 @@ def test_a_correction_counts_and_the_first_mark_stays(log):
     log.add(mark("ada", "rollout-1"))
     number = log.add(mark("ada", "rollout-1", standing=False))
     assert [one.mark.holds["standing"] for one in log.history()] == [True, False]
-    (latest,) = MarkLog(log.path).latest().values()
+    (latest,) = MarkLog(log.path).latest()
     assert (latest.number, latest.mark.holds) == (number, {"standing": False})
 
 
@@ -132,7 +132,7 @@ def test_one_rated_rollout_has_no_interval(log):
     for rater in ("ada", "bob"):
         log.add(mark(rater, IDS[0], standing=rater == "ada"))
     tasks = dict.fromkeys(IDS, "stand_bottle")
-    found = rating_report(log.latest().values(), tasks, read_rubrics(), {})["tasks"]["stand_bottle"]
+    found = rating_report(log.latest(), tasks, read_rubrics(), {})["tasks"]["stand_bottle"]
     assert (found["score"], found["score_interval"], found["raters"]) == (0.5, "undefined", [])
 
 
@@ -141,6 +141,14 @@ def test_automatic_marks_do_not_take_a_person_s_place(log):
         log.add(mark("probe", name, kind="auto"))
     queue = RatingQueue(rollouts(), log, raters_per_rollout=1, repeat_share=0.0)
     assert len(rate_all(queue, log, "ada")) == 12
+
+
+def test_a_program_with_the_name_of_a_person_corrects_nothing_of_theirs(log):
+    log.add(mark("ada", IDS[0], standing=True))
+    log.add(mark("ada", IDS[0], standing=False, kind="auto"))
+    tasks = {IDS[0]: "stand_bottle"}
+    (row,) = rating_report(log.latest(), tasks, read_rubrics(), {})["rollouts"]
+    assert (row["human_scores"], row["auto_scores"]) == ([1.0], [0.0])
 
 
 def test_a_program_sees_a_tie_of_people_once(log):
@@ -165,7 +173,7 @@ def test_the_report_by_hand(log):
     log.add(mark("probe", IDS[1], kind="auto"))
     log.add(mark("ada", "of-another-store"))
     tasks = dict.fromkeys(IDS, "stand_bottle")
-    found = rating_report(log.latest().values(), tasks, read_rubrics(), {IDS[1]: 1.0, IDS[2]: 0.0})
+    found = rating_report(log.latest(), tasks, read_rubrics(), {IDS[1]: 1.0, IDS[2]: 0.0})
     scores = {row["episode_id"]: row["score"] for row in found["rollouts"]}
     assert scores == {IDS[0]: 1.0, IDS[1]: 0.5, IDS[2]: 0.0, IDS[3]: 0.0}
     assert found["rollouts"][1]["auto_scores"] == [1.0]
@@ -193,9 +201,7 @@ def test_two_raters_who_differ_are_decided_by_a_third_who_is_neither(log):
     decided = rate_all(queue, log, "carl", standing=lambda name: name == IDS[2])
     assert sorted(decided) == [(IDS[2], DECIDING), (IDS[3], DECIDING)]
     assert queue.next("dora") is None
-    found = rating_report(
-        log.latest().values(), dict.fromkeys(IDS, "stand_bottle"), read_rubrics(), {}
-    )
+    found = rating_report(log.latest(), dict.fromkeys(IDS, "stand_bottle"), read_rubrics(), {})
     rows = {row["episode_id"]: row["decided_score"] for row in found["rollouts"]}
     assert rows == {IDS[0]: 1.0, IDS[1]: 1.0, IDS[2]: 1.0, IDS[3]: 0.0}
     task = found["tasks"]["stand_bottle"]
@@ -235,7 +241,7 @@ def test_nobody_decides_without_a_tie_or_twice(log):
     queue.check(mark("carl", IDS[1]))
     # Marks of before that was refused: one rater, one vote.
     log.add(mark("carl", IDS[0]))
-    latest = (stored.mark for stored in log.latest().values())
+    latest = (stored.mark for stored in log.latest())
     assert [one.rater for one in by_people(latest)[IDS[0]]] == ["ada", "bob", "carl"]
 
 
@@ -251,7 +257,7 @@ def test_a_deciding_mark_is_not_repeated(log):
 def test_a_tie_is_a_conflict_once_its_raters_are_complete(log):
     for rater, stands in (("ada", True), ("bob", False)):
         log.add(mark(rater, IDS[0], standing=stands))
-    known, rubrics, found = log.latest().values(), read_rubrics(), []
+    known, rubrics, found = log.latest(), read_rubrics(), []
     for num in (2, 3):
         tasks = {IDS[0]: "stand_bottle"}
         report = rating_report(known, tasks, rubrics, {}, raters_per_rollout=num)
