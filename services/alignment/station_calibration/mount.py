@@ -351,7 +351,8 @@ class MountSession:
             (
                 sighting.late_s > MAX_LATE_S,
                 f"images or poses arrive {sighting.late_s:.1f} s late, so that they do not belong "
-                "together: the station is overloaded; close other programs, or set it to JPEG",
+                "together: the station is overloaded; close its other programs, or send smaller "
+                "images",
             ),
             (not self.is_still, "moving, or blurred: hold still"),
             (
