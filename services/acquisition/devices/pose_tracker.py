@@ -63,8 +63,8 @@ class PoseGate:
     Reachable means: at 5 m/s and 2000 °/s at most. The time in between is the device's, at least
     half a period for every packet, so that a step of its clock cannot shut the gate for good. A
     position of exactly (0, 0, 0) is what trackers send for "none", also before they have seen
-    anything; it is refused. A quaternion and its negative are the same rotation. `dropped` counts packets that become
-    no sample, by the reason.
+    anything; it is refused. A quaternion and its negative are the same rotation. `dropped` counts
+    packets that become no sample, by the reason.
     """
 
     def __init__(self, dropped: dict[str, int]) -> None:

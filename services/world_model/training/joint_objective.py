@@ -237,9 +237,14 @@ def own_context(
     middle = len(batch.requests[0].actions) // 2
     firsts = [replace(request, actions=request.actions[: middle + 1]) for request in batch.requests]
     if torch.rand((), generator=generator).item() >= OWN_CONTEXT_SHARE:
-        parts = (batch.images, batch.tactile_kpa, batch.tactile_valid)
-        cut = (part[:, : middle + 1] for part in parts)
-        return WindowBatch(firsts, *cut, batch.measured_taxels)
+        kept = slice(middle + 1)
+        return replace(
+            batch,
+            requests=firsts,
+            images=batch.images[:, kept],
+            tactile_kpa=batch.tactile_kpa[:, kept],
+            tactile_valid=batch.tactile_valid[:, kept],
+        )
     noise = mapped(
         model.noise(middle + 1, generator),
         lambda one: processes.randn([len(firsts), *one.shape[1:]], generator),
