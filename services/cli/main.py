@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from dextouch import __version__
-from dextouch.command_line import messages_aside
+from dextouch.command_line import garbage_collection_paused, messages_aside
 from dextouch.errors import DexTouchError, UnknownNameError
 from dextouch.free_text import printable
 from services.cli.extras import missing_package
@@ -109,7 +109,8 @@ def _warn_of_unknown_variables(name: str, section: str, arguments: list[str]) ->
 
 def _found(place: str) -> Any:  # noqa: ANN401 - functions and classes
     module, _, name = place.partition(":")
-    return getattr(importlib.import_module(f"services.{module}"), name)
+    with garbage_collection_paused():
+        return getattr(importlib.import_module(f"services.{module}"), name)
 
 
 def _show_help(flags: str, arguments: list[str]) -> None:

@@ -6,9 +6,9 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from dextouch.command_line import ProgressLines, progress, write_result
+from dextouch.command_line import ProgressLines, garbage_collection_paused, progress, write_result
 from dextouch.serving import load_settings
-from dextouch.worlds import World, serve_worlds
+from dextouch.worlds import World
 from services.networks.weight_files import digest_of
 from services.world_model import checkpoints, paper_settings
 from services.world_model.network.model import Sampling
@@ -33,8 +33,10 @@ def run_train(arguments: list[str]) -> int:
         return _train_state(settings)
     if settings.plan:
         settings = settings.model_copy(update={"network": settings.with_adapters().network})
-        print(plan_table(settings.network))
-        print(training_table(settings, settings.plan_processes))
+        # Which includes the import of diffusers.
+        with garbage_collection_paused():
+            print(plan_table(settings.network))
+            print(training_table(settings, settings.plan_processes))
         return 0
     return _train(settings, settings.json_path)
 
@@ -113,6 +115,8 @@ def _show(report: "TrainingReport | StateReport", counts: str, json_path: Path |
 
 def run_serve(arguments: list[str]) -> int:
     """Serve a checkpoint until SIGINT or SIGTERM; rollouts of others in its folder continue."""
+    from dextouch.worlds import serve_worlds
+
     load = partial(load_settings, WorldModelSettings, arguments)
     settings = load()
     serve_worlds(

@@ -36,11 +36,9 @@ _CARDS_GB: Final = (24, 80, 141)
 # Layers that deeper models are planned from, by what the last one adds; with fewer, sampler steps
 # still need more from layer to layer.
 _FEW_LAYERS: Final = 4
-# Text encoder of the published model, UMT5-XXL.
-_TEXT_ENCODER: Final = {
-    "vocab_size": 256384, "d_model": 4096, "d_kv": 64, "d_ff": 10240, "num_layers": 24,
-    "num_heads": 64,
-}  # fmt: skip
+# Text encoder of the published model, UMT5-XXL: its width, and weights as transformers builds them.
+_TEXT_WIDTH: Final = 4096
+TEXT_ENCODER_WEIGHTS: Final = 5_680_910_336
 
 
 @dataclass(frozen=True)
@@ -279,14 +277,14 @@ def plan_of(config: NetworkConfig) -> Plan:
 def _of_depth(config: NetworkConfig, planned: Callable[[JointWorldModel], PlanT]) -> PlanT:
     """A plan of many layers from those of few: each further one needs the same."""
     further = config.num_layers - _FEW_LAYERS
+    few_layers = config.model_copy(update={"num_layers": config.num_layers - max(0, further)})
     with torch.device("meta"):
-        few_layers = config.model_copy(update={"num_layers": config.num_layers - max(0, further)})
         model = JointWorldModel(few_layers)
-        plan = planned(model)
-        if further <= 0:
-            return plan
-        del model.layers[-1]
-        return cast("PlanT", _further(planned(model), plan, further))
+    plan = planned(model)
+    if further <= 0:
+        return plan
+    del model.layers[-1]
+    return cast("PlanT", _further(planned(model), plan, further))
 
 
 def _further(few: object, more: object, num: int) -> object:
@@ -410,9 +408,10 @@ def _weights(model: JointWorldModel) -> _Weights:
 def _backward(model: JointWorldModel, num_windows: int) -> PeakMemory:
     """Memory of forward and backward, of which no gradient stays."""
     steps = model.config.max_steps
-    inputs = _inputs(model.config, steps, num_windows)
-    first, noisy = _latents(model, steps, num_windows)
-    t = torch.ones(num_windows)
+    with torch.device("meta"):
+        inputs = _inputs(model.config, steps, num_windows)
+        first, noisy = _latents(model, steps, num_windows)
+        t = torch.ones(num_windows)
     with PeakMemory((*model.parameters(), *model.buffers())) as memory:
         hooks = [
             weight.register_post_accumulate_grad_hook(memory.drop)  # type: ignore[no-untyped-call]
@@ -437,12 +436,12 @@ def _of_codec(config: NetworkConfig) -> NetworkConfig:
 @cache
 def _encoding_bytes(config: NetworkConfig, num_windows: int) -> int:
     """What the codec takes for the latents of some windows."""
-    with torch.device("meta"), torch.no_grad():
+    shape = config.max_steps, config.image_px, config.image_px, 3
+    with torch.device("meta"):
         codec = JointWorldModel(config).codec
-        shape = config.max_steps, config.image_px, config.image_px, 3
         images = torch.zeros(num_windows * config.num_views, *shape)
-        with PeakMemory((*codec.parameters(), *codec.buffers())) as memory:
-            codec.encode(images)
+    with torch.no_grad(), PeakMemory((*codec.parameters(), *codec.buffers())) as memory:
+        codec.encode(images)
     return memory.peak_bytes
 
 
@@ -456,40 +455,42 @@ def _parts(model: JointWorldModel) -> tuple[Part, ...]:
         "visual codec": [model.codec],
         "tactile tokenizer": [model.tokenizer],
     }
-    wan = model.config.wan
-    if wan is not None and wan.text_width == _TEXT_ENCODER["d_model"]:
-        groups["text encoder (once per instruction)"] = [_text_encoder(wan.dtype)]
     parts = []
     for name, group in groups.items():
         modules = nn.ModuleList(group)
         # Shared weights are counted once.
         tensors = {**dict(modules.named_parameters()), **dict(modules.named_buffers())}
         parts.append(Part(name, sum(t.numel() for t in tensors.values()), memory_of(tensors)))
+    wan = model.config.wan
+    if wan is not None and wan.text_width == _TEXT_WIDTH:
+        num, name = TEXT_ENCODER_WEIGHTS, "text encoder (once per instruction)"
+        parts.append(Part(name, num, num * wan.dtype.itemsize))
     return tuple(parts)
-
-
-@cache
-def _text_encoder(dtype: torch.dtype) -> nn.Module:
-    from transformers import UMT5Config, UMT5EncoderModel
-
-    return UMT5EncoderModel(UMT5Config(**_TEXT_ENCODER)).to(dtype)
 
 
 def _work(model: JointWorldModel, num_steps: int) -> tuple[tuple[Work, ...], int]:
     """Computations of a chunk, and the memory that the sampler's steps share."""
-    config, inputs = model.config, _inputs(model.config, num_steps)
-    first, noisy = _latents(model, num_steps)
+    config = model.config
+    with torch.device("meta"):
+        inputs, t = _inputs(config, num_steps), torch.ones(1)
+        first, noisy = _latents(model, num_steps)
 
     def share() -> Context:
         context = model.context(inputs, first)
         return replace(context, clean=model.clean_tokens(context, noisy))
 
     def step() -> JointLatents:
-        return model.denoise(context, noisy, torch.ones(1))
+        return model.denoise(context, noisy, t)
 
-    context = share()
+    contexts: list[Context] = []
+    shared = _measured(
+        ("what sampler steps share", 1),
+        lambda: contexts.append(share()),
+        model,
+        _tensors_of((inputs, first, noisy)),
+    )
+    (context,) = contexts
     kept = {str(id(tensor)): tensor for tensor in _tensors_of(context)}
-    shared = _measured(("what sampler steps share", 1), share, model, kept.values())
     steps = ("one sampler step", config.sampling_steps)
     sampled = _measured(steps, step, model, kept.values())
     encoded, *decoded = _codec_work(_of_codec(config), num_steps)
@@ -499,8 +500,9 @@ def _work(model: JointWorldModel, num_steps: int) -> tuple[tuple[Work, ...], int
 @cache
 def _codec_work(config: NetworkConfig, num_steps: int) -> tuple[Work, ...]:
     """Computations of codec and tokenizer, which are equal in both precisions and all depths."""
-    model, inputs = JointWorldModel(config).eval(), _inputs(config, num_steps)
-    first, noisy = _latents(model, num_steps)
+    with torch.device("meta"):
+        model, inputs = JointWorldModel(config).eval(), _inputs(config, num_steps)
+        first, noisy = _latents(model, num_steps)
     jobs: dict[str, Callable[[], object]] = {
         "encode the first image": lambda: model.first_latents(inputs),
         _DECODING[0]: lambda: model.decode(first, noisy),

@@ -14,6 +14,7 @@ from typing import Any, Final, Generic, TypeVar
 import torch
 from jaxtyping import Float, Float32, Int64
 from torch import Tensor, nn
+from torch.nn.functional import pad
 
 from dextouch.errors import CorruptDataError, InvalidInputError, NotFoundError
 from services.networks.weight_files import read_tensors, write_tensors
@@ -128,13 +129,9 @@ class TextFeatures:
 
     def stack(self, texts: Sequence[str]) -> Float[Tensor, "batch words width"]:
         """Features of several texts, padded with zeros to `text_tokens`; raises as `of`."""
-        padded = torch.zeros(
-            len(texts), self._config.text_tokens, self._config.text_width, dtype=self._config.dtype
-        )
-        for row, text in zip(padded, texts, strict=True):
-            features = self.of(text)
-            row[: len(features)] = features
-        return padded
+        words, dtype = self._config.text_tokens, self._config.dtype
+        each = [self.of(text) for text in texts]
+        return torch.stack([pad(one.to(dtype), (0, 0, 0, words - len(one))) for one in each])
 
     def of(self, text: str) -> Float[Tensor, "words width"]:
         """Features of one text.

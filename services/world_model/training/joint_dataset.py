@@ -32,6 +32,7 @@ from services.world_model.network.inputs import (
     PastRule,
     PredictionRequest,
 )
+from services.world_model.training.scene_table import LEAST_MEASURED, filled_taxels
 
 # Open readers per process; each holds an episode's timestamps and actions.
 MAX_OPEN_READERS = 512
@@ -59,7 +60,11 @@ class WindowPosition:
 
 @dataclass(frozen=True)
 class Window:
-    """One slice of an episode: the request to the model and the true future."""
+    """One slice of an episode: the request to the model and the true future.
+
+    Taxels that are not `measured_taxels` have the pressure of the nearest one of their pad that is,
+    or none; hands of which less than half is measured are not valid.
+    """
 
     request: PredictionRequest
     images: UInt8[np.ndarray, "time h w 3"]
@@ -144,9 +149,12 @@ class _Episode(ABC):
             past = PastImages(poses[rows], place.start - kept[rows], images)
         views = views_at(steps)
         head, *further = _filled(views)
+        felt_kpa, valid, measured = span.touch
+        touch_kpa = filled_taxels(felt_kpa, measured, self.tactile_layout)
+        valid = valid & (measured.mean(axis=-1) >= LEAST_MEASURED)
         request = PredictionRequest(
             first_image=head[0],
-            first_tactile_kpa=span.touch[0][0],
+            first_tactile_kpa=touch_kpa[0],
             actions=actions,
             action_kind=place.action_kind,
             instruction=span.instruction,
@@ -156,7 +164,8 @@ class _Episode(ABC):
             further_images=tuple(None if one is None else one[0] for one in views[1:]),
             past=past,
         )
-        return Window(request, head, *span.touch, np.stack(further) if further else None)
+        more = np.stack(further) if further else None
+        return Window(request, head, touch_kpa, valid, measured, more)
 
 
 def _filled(views: Sequence[np.ndarray | None]) -> list[UInt8[np.ndarray, "n h w 3"]]:
@@ -234,6 +243,7 @@ class WindowBatch:
     images: UInt8[Tensor, "batch time px px 3"]
     tactile_kpa: Float32[Tensor, "batch time 2 taxels"]
     tactile_valid: Bool[Tensor, "batch time 2"]
+    measured_taxels: Bool[Tensor, "batch 2 taxels"]
     further: UInt8[Tensor, "batch views time px px 3"] | None = None
 
 
@@ -245,6 +255,7 @@ def stack_windows(windows: Sequence[Window]) -> WindowBatch:
         torch.from_numpy(np.stack([window.images for window in windows])),
         torch.from_numpy(np.stack([window.tactile_kpa for window in windows])),
         torch.from_numpy(np.stack([window.tactile_valid for window in windows])),
+        torch.from_numpy(np.stack([window.measured_taxels for window in windows])),
         torch.from_numpy(np.stack(further)) if further else None,
     )
 

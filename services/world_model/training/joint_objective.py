@@ -80,8 +80,9 @@ class LossOptions:
 class Examples:
     """What the network is given for some windows, what it should answer, and how that counts.
 
-    `counted` weighs errors of tactile tokens, `num_counted` is their sum over the windows of a
-    step, per process; `share` is that of these windows.
+    `counted` weighs errors of tactile tokens, 0 of those of which nothing was measured;
+    `num_counted` is their sum over the windows of a step, per process; `share` is that of these
+    windows.
     """
 
     inputs: ModelInputs
@@ -149,13 +150,12 @@ def examples_of(
         # Of the straight path from data to noise.
         target = combined([noise, clean], lambda pair: pair[0] - pair[1])
     valid = batch.tactile_valid.to(device)
-    counted = (valid & valid[:, :1])[:, 1:, :, None]
+    num_tokens, layout = clean.tactile.shape[3], model.config.tactile_layout
+    is_measured = in_tokens(batch.measured_taxels.to(device)[:, None], num_tokens, layout)
+    counted = (valid & valid[:, :1])[:, 1:, :, None] & is_measured
     if options.touch_loss == "contact_or_changing":
-        tokens = contact_or_changing(
-            tactile_kpa, clean.tactile.shape[3], model.config.tactile_layout
-        )
-        counted = counted & tokens[:, 1:]
-    weights = counted[..., None].float().expand(-1, -1, -1, clean.tactile.shape[3], -1)
+        counted = counted & contact_or_changing(tactile_kpa, num_tokens, layout)[:, 1:]
+    weights = counted[..., None].float()
     num_counted = processes.mean(weights.sum())
     return Examples(inputs, first, noisy, t, target, weights, num_counted)
 
@@ -188,6 +188,13 @@ def contact_or_changing(
     before = torch.cat([tactile_kpa[:, :1], tactile_kpa[:, :-1]], dim=1)
     contact = tactile_kpa >= CONTACT_THRESHOLD_KPA
     taxels = contact | contact[:, :1] | ((tactile_kpa - before).abs() >= CHANGE_KPA)
+    return in_tokens(taxels, num_tokens, layout)
+
+
+def in_tokens(
+    taxels: Bool[Tensor, "batch time 2 taxels"], num_tokens: int, layout: TactileLayout
+) -> Bool[Tensor, "batch time 2 tokens"]:
+    """Tokens of which any taxel is marked; there is one for each pad, or for the hand."""
     if num_tokens == 1:
         return taxels.any(dim=-1, keepdim=True)
     pads = torch.split(taxels, [pad.num_taxels for pad in layout.pads], dim=-1)
@@ -230,8 +237,14 @@ def own_context(
     middle = len(batch.requests[0].actions) // 2
     firsts = [replace(request, actions=request.actions[: middle + 1]) for request in batch.requests]
     if torch.rand((), generator=generator).item() >= OWN_CONTEXT_SHARE:
-        parts = (batch.images, batch.tactile_kpa, batch.tactile_valid)
-        return WindowBatch(firsts, *(part[:, : middle + 1] for part in parts))
+        kept = slice(middle + 1)
+        return replace(
+            batch,
+            requests=firsts,
+            images=batch.images[:, kept],
+            tactile_kpa=batch.tactile_kpa[:, kept],
+            tactile_valid=batch.tactile_valid[:, kept],
+        )
     noise = mapped(
         model.noise(middle + 1, generator),
         lambda one: processes.randn([len(firsts), *one.shape[1:]], generator),
@@ -245,6 +258,7 @@ def own_context(
         torch.cat([images, batch.images[:, middle + 1 :]], dim=1),
         torch.cat([touch, batch.tactile_kpa[:, middle + 1 :]], dim=1),
         batch.tactile_valid[:, middle:],
+        batch.measured_taxels,
     )
 
 

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from dextouch.command_line import ProgressLines
+from dextouch.errors import InvalidInputError
 from dextouch.images import decode_jpeg, encode_jpeg
 from dextouch.schemas import MAX_OBJECTS
 from dextouch.tactile import CONTACT_THRESHOLD_KPA
@@ -351,7 +352,14 @@ def _draw(
     table = data.table
     is_first = rng.random() < settings.first_fraction
     later = [step for step in start_steps(table) if step > 0 and len(table.starts_at(step))]
-    start_step = 0 if is_first or not later else _later_start(later, table, rng)
+    starts_at_first = len(table.starts_at(0)) > 0
+    if not (later or starts_at_first):
+        raise InvalidInputError(
+            "training: no take has a step with an image, measured actions and four more steps "
+            "behind it, which cores start from; align the takes without the gap at their start"
+        )
+    is_first = starts_at_first and (is_first or not later)
+    start_step = 0 if is_first else _later_start(later, table, rng)
     able = table.starts_at(start_step)
     rows = table.drawn(able, settings.batch, generator)
 

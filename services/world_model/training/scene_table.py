@@ -340,12 +340,22 @@ def _touch(
 def filled_touch(
     episode: EpisodeGrid,
 ) -> tuple[Float32[np.ndarray, "steps 2 taxels"], Bool[np.ndarray, "steps 2"]]:
-    """Pressures (kPa) with unmeasured taxels as the nearest of their pad, and what was sampled."""
+    """Pressures (kPa) of `filled_taxels`, and what was sampled."""
     touch_kpa, is_sampled = episode.touch()
-    measured = episode.measured_taxels
-    nearest = np.stack([_nearest_measured(hand, episode.tactile_layout) for hand in measured])
+    return filled_taxels(touch_kpa, episode.measured_taxels, episode.tactile_layout), is_sampled
+
+
+def filled_taxels(
+    touch_kpa: Float32[np.ndarray, "steps 2 taxels"],
+    measured: Bool[np.ndarray, "2 taxels"],
+    layout: TactileLayout,
+) -> Float32[np.ndarray, "steps 2 taxels"]:
+    """Pressures (kPa) with unmeasured taxels as the nearest measured one of their pad, or 0."""
+    if measured.all():
+        return touch_kpa
+    nearest = np.stack([_nearest_measured(hand, layout) for hand in measured])
     is_known = np.take_along_axis(measured, nearest, axis=-1)
-    return np.take_along_axis(touch_kpa, nearest[None], axis=-1) * is_known, is_sampled
+    return np.take_along_axis(touch_kpa, nearest[None], axis=-1) * is_known
 
 
 def _nearest_measured(

@@ -15,7 +15,7 @@ from urllib.parse import unquote
 import numpy as np
 from fastapi import APIRouter, Depends, Path, Query, Request, Response
 from jaxtyping import Shaped
-from pydantic import Field
+from pydantic import Field, StrictFloat
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Receive, Scope, Send
@@ -86,7 +86,7 @@ class ActionsBody(FrozenModel):
     model_config = example(actions=[[0.0] * ACTION_DIM] * 4)
 
     actions: Annotated[
-        list[Annotated[list[float], Field(fail_fast=True)]],
+        list[Annotated[list[StrictFloat], Field(fail_fast=True)]],
         Field(fail_fast=True, max_length=MAX_ROWS),
     ]
 

@@ -17,6 +17,7 @@ from services.world_model.training.joint_dataset import (
 )
 from tests.unit.evaluation import toy
 from tests.unit.evaluation import toy_store as toy_store_of_takes
+from tests.unit.world_model.conftest import make_episode
 
 
 @pytest.mark.parametrize("kind", ["measured", "commanded"])
@@ -120,3 +121,24 @@ def test_other_actions_are_another_fingerprint(toy_episode):
     before = episode.fingerprint()
     episode.actions["measured"][3, 20] += 0.01
     assert episode.fingerprint() != before
+
+
+def test_refused_taxels_never_reach_a_window():
+    clean, refused = make_episode(0), np.zeros((2, 320), dtype=bool)
+    refused[0, ::3] = True
+    # The whole left index finger, and most of the right hand.
+    refused[0, 16:32], refused[1, 100:] = True, True
+    noise = np.random.default_rng(1).uniform(0, 500, clean.tactile_kpa.shape).astype(np.float32)
+    windows = []
+    for value in (clean.tactile_kpa, noise):
+        touch = np.where(refused, value, clean.tactile_kpa)
+        episode = replace(clean, tactile_kpa=touch, measured_taxels=~refused)
+        windows.append(episode.cut(WindowPosition(3, 0, 9)))
+    one, other = windows
+    np.testing.assert_array_equal(one.tactile_kpa, other.tactile_kpa)
+    np.testing.assert_array_equal(one.request.first_tactile_kpa, other.request.first_tactile_kpa)
+    np.testing.assert_array_equal(
+        one.tactile_kpa[:, ~refused], clean.tactile_kpa[3:12][:, ~refused]
+    )
+    assert (one.tactile_kpa[:, 0, 16:32] == 0).all()
+    assert one.tactile_valid.all(axis=0).tolist() == [True, False]

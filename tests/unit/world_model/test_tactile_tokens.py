@@ -101,6 +101,21 @@ def test_a_hand_that_was_not_measured_costs_no_pad_anything(tiny_config, toy_epi
     assert loss.tactile.item() == pytest.approx(4.0)
 
 
+def test_a_pad_that_was_not_measured_costs_nothing(tiny_config, toy_episodes):
+    model = _model(tiny_config, "split_hands", "pad")
+    refused = np.ones((2, 320), dtype=bool)
+    # The index finger of the right hand.
+    refused[1, 16:32] = False
+    episodes = [replace(episode, measured_taxels=refused) for episode in toy_episodes]
+    batch = WindowSampler(episodes, np.random.default_rng(0), max_steps=17).draw(2, 9)
+    target = model.targets(batch.images, batch.tactile_kpa)
+    wrong = torch.full_like(target.tactile, 2.0)
+    wrong[:, :, 1, 1] = 50.0
+    model.forward = lambda *_: JointLatents(target.video, target.tactile + wrong)
+    loss = losses(model, batch, generator=torch.Generator().manual_seed(0))
+    assert loss.tactile.item() == pytest.approx(4.0)
+
+
 @pytest.mark.parametrize("tokenizer", ["principal_axes", "grid"])
 def test_only_split_hands_has_pad_tokens(tokenizer):
     with pytest.raises(InvalidInputError, match="only split_hands has a token for each pad"):

@@ -242,6 +242,8 @@ async def test_a_key_needs_the_scope_rollout():
         (b'{"actions": [[NaN]]}', JSON, 422, "67"),
         (b'{"actions": [' + b"[]," * 5000 + b"[]]}", JSON, 422, "at most 4096 items"),
         (json.dumps({"actions": [[float("nan")] * 67] * 4}).encode(), JSON, 422, "NaN"),
+        (json.dumps({"actions": [["1"] * 67] * 4}).encode(), JSON, 422, "valid number"),
+        (json.dumps({"actions": [[True] * 67] * 4}).encode(), JSON, 422, "valid number"),
         (b'{"actions": 3, "more": 1}', JSON, 422, "actions"),
         (actions(4, 1e6).tobytes(), FLOAT64, 422, "1e6 cannot"),
         (actions(4, 3e6).tobytes(), FLOAT64, 422, "stays as it was"),

@@ -5,7 +5,8 @@ sides the neighbour that the values at its first and last step are made of. An e
 as it is: of H.264 the group of pictures of the first image stays whole, unless `exact`.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
+from itertools import islice
 
 import numpy as np
 
@@ -31,6 +32,8 @@ _OF_EVERY_PART = "_taxels"
 # Of one block, as of the uploads of a commit.
 _BLOCK_BYTES = 4 << 20
 _BLOCK_IMAGES = 4 * GOP_IMAGES
+# Of names that a message lists.
+_SHOWN = 6
 Span = tuple[int, int]
 
 
@@ -116,6 +119,12 @@ def trim_episode(
         return edit.run(attributes, counts, write, remarks)
 
 
+def _some(names: Collection[str]) -> str:
+    """The first names, and how many there are beside."""
+    shown, beside = ", ".join(islice(names, _SHOWN)), len(names) - _SHOWN
+    return f"{shown} and {beside} others, which the source keeps" if beside > 0 else shown
+
+
 def _trimmed_attributes(
     edit: Edit, reader: EpisodeReader, steps: Span, outcome: EditedOutcome | None
 ) -> EpisodeAttributes:
@@ -154,7 +163,7 @@ def _trimmed_attributes(
         found = [interpolated_actions(about.calibration, grid_ns[first:stop], k) for k in kinds]
         quality["num_steps_interpolated"] = float(np.any(found, axis=(0, 2)).sum())
     if lost := sorted(set(about.quality) - set(quality)):
-        edit.messages.append(f"figures of the whole are left out: {', '.join(lost)}")
+        edit.messages.append(f"figures of the whole are left out: {_some(lost)}")
     changes |= {"event_times_s": events, "calibration": calibration, "quality": quality}
     return about.model_copy(update=changes)
 
@@ -289,7 +298,7 @@ def trim_recording(
         changes = new_outcome(about, outcome, lacking="its end is cut off" * is_cut_off)
         more = {"recording_id": edit.new_id, "lineage": edit.lineage, "quality": {}}
         if about.quality:
-            edit.messages.append(f"figures of the whole are left out: {', '.join(about.quality)}")
+            edit.messages.append(f"figures of the whole are left out: {_some(about.quality)}")
         spans: dict[str, Span] = {}
         for name in reader.streams:
             stamps_ns = reader.stamps_ns(name)
