@@ -62,9 +62,9 @@ class PoseGate:
 
     Reachable means: at 5 m/s and 2000 °/s at most. The time in between is the device's, at least
     half a period for every packet, so that a step of its clock cannot shut the gate for good. A
-    position of exactly (0, 0, 0) is what trackers send for "none", also before they have seen
-    anything; it is refused. A quaternion and its negative are the same rotation. `dropped` counts
-    packets that become no sample, by the reason.
+    position of exactly (0, 0, 0) is what trackers send for "none"; it is never reached from another
+    one. A quaternion and its negative are the same rotation. `dropped` counts packets that become
+    no sample, by the reason.
     """
 
     def __init__(self, dropped: dict[str, int]) -> None:
@@ -87,8 +87,7 @@ class PoseGate:
     ) -> Sample | None:
         """The sample of a pose x y z (m) qw qx qy qz (unit) in the world; None where it jumps."""
         self._pass_time(t_device_ns)
-        is_none = not any(pose[:3])
-        if is_none or (self._last is not None and not self._is_reachable(self._last, pose)):
+        if self._last is not None and not self._is_reachable(self._last, pose):
             self._dropped["jumped"] += 1
             return None
         self._last, self._elapsed_ns = pose, 0
@@ -100,6 +99,8 @@ class PoseGate:
         self._t_device_ns = t_device_ns
 
     def _is_reachable(self, last: Sequence[float], pose: Sequence[float]) -> bool:
+        if not any(pose[:3]) and any(last[:3]):
+            return False
         elapsed_s = self._elapsed_ns / 1e9
         if math.dist(pose[:3], last[:3]) > MAX_SPEED_M_PER_S * elapsed_s:
             return False
