@@ -210,24 +210,6 @@ def test_cores_begin_anywhere_up_to_the_last_latent_step(config):
     assert torch.isfinite(core_loss(core, data, latest, settings))
 
 
-def test_cores_begin_later_where_no_take_has_a_measured_first_step(config):
-    table = scene_table([episode(seed) for seed in range(2)], config)
-    data = CoreData(table, touch_latents(TouchCodec(8), table), {})
-    settings = CoreSettings(batch=2, first_fraction=1.0)
-
-    def start(interpolated):
-        given = dataclasses.replace(table, interpolated=interpolated)
-        some = dataclasses.replace(data, table=given)
-        return _draw(some, settings, torch.Generator(), np.random.default_rng(0)).start_step
-
-    given = torch.zeros_like(table.interpolated)
-    assert start(given) == 0
-    given[:, 0] = True
-    assert start(given) > 0
-    with pytest.raises(InvalidInputError, match="no take has a step with an image"):
-        start(torch.ones_like(given))
-
-
 def test_a_core_knows_the_boxes_of_its_tasks_and_what_moves():
     config = DynamicsConfig(tasks=("lift", "press"), num_objects=(1, 1), image_px=PX, width=32)
     episodes = [changed(episode(seed), task=("press", "lift")[seed % 2]) for seed in range(8)]

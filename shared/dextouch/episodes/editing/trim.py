@@ -122,7 +122,7 @@ def trim_episode(
 def _some(names: Collection[str]) -> str:
     """The first names, and how many there are beside."""
     shown, beside = ", ".join(islice(names, _SHOWN)), len(names) - _SHOWN
-    return f"{shown} and {beside} others, which the source keeps" if beside > 0 else shown
+    return f"{shown}, and {beside} more" if beside > 0 else shown
 
 
 def _trimmed_attributes(

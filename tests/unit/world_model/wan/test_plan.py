@@ -36,7 +36,7 @@ from tests.unit.world_model.wan.test_trained_parts import changed
 __all__ = ["settings"]
 
 KIB = 1024
-# https://huggingface.co/google/umt5-xxl, config.json
+# The text encoder of Wan: layers and widths of UMT5-XXL.
 UMT5_XXL = {
     "vocab_size": 256384, "d_model": 4096, "d_kv": 64, "d_ff": 10240, "num_layers": 24,
     "num_heads": 64,
